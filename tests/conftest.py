@@ -1,0 +1,36 @@
+"""Shared by all tests: annotations become checks, and fixtures for the data.
+
+The import hook has to be installed before the first import of a package of ours,
+so it stands above everything else. `is_pep484_tower` lets an `int` pass for a
+`float`, as type checkers do.
+"""
+
+from jaxtyping import install_import_hook
+
+install_import_hook(
+    ["sim", "replay", "actors", "learner", "launch"],
+    "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))",
+)
+
+import os  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+# Broadcasting and promotion are spelled out in the code: a missing axis or a stray
+# float64 is a bug to find here, not a slow or wrong program later.
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(scope="session")
+def scenes_data() -> Path:
+    """The folder of real scenes; a test that needs it is skipped without it."""
+    value = os.environ.get("SLIPSTREAM_DATA", "")
+    if not value:
+        pytest.skip("SLIPSTREAM_DATA is not set: no real scenes to test on")
+    path = Path(value)
+    if not path.is_dir():
+        pytest.skip(f"SLIPSTREAM_DATA: no folder {path}")
+    return path
