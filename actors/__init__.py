@@ -1,0 +1,1 @@
+"""Actors: the policy in JAX, the acting loop, evaluation. No torch."""

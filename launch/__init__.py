@@ -1,0 +1,1 @@
+"""The command line: configuration, supervision, console, viewer. Nothing imports it."""

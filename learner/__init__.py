@@ -1,0 +1,1 @@
+"""The learner: the network in torch, double DQN, checkpoints."""

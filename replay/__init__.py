@@ -1,0 +1,1 @@
+"""The replay service and the run's channels over Zenoh. Knows nothing of driving."""

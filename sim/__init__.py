@@ -1,0 +1,1 @@
+"""The simulator: scenes, dynamics, metrics, observations, agents. JAX and numpy only."""

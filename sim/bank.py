@@ -1,0 +1,248 @@
+"""The scene bank: all scenes of a run as fixed tables in one memory-mapped file.
+
+A scene is converted once. Every array of `Bank` holds all scenes; per-scene tables of
+different lengths stand one behind the other with the scene's first row in a `_start`
+array, so that a reset is a change of index. Positions are local to the scene: its
+origin, kept in double precision, is subtracted before anything is rounded to float32.
+
+File: the magic, the header's length (uint64, little-endian), the header (JSON: version,
+sizes, scenario ids, origins, one {name, dtype, shape, offset} per array, the SHA-256 of
+the data), then the arrays, each at a multiple of `ALIGNMENT` so that JAX on a CPU can
+use the mapped pages as they are.
+"""
+
+import hashlib
+import json
+import mmap
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+from sim import convert
+from sim.scene import Scene
+
+MAGIC = b"SLIPBANK"
+VERSION = 1
+ALIGNMENT = 4096
+
+
+class BankError(Exception):
+    """A bank cannot be read or written; the message says what, where, what to do."""
+
+
+class Bank(NamedTuple):
+    """The arrays, one leading axis `scenes` or a flat table that `_start` indexes."""
+
+    current_step: Int[Array, " scenes"]  # first step to act at
+    steps: Int[Array, " scenes"]  # recorded steps, <= the log's axis
+    objects: Int[Array, " scenes"]  # recorded objects, <= the log's axis
+    sdc: Int[Array, " scenes"]  # the recording vehicle's row
+    log: Float[Array, "scenes steps objects 8"]  # LOG_FIELDS
+    log_valid: Bool[Array, "scenes steps objects"]
+    object_type: Int[Array, "scenes objects"]  # `ObjectType`
+    route: Float[Array, "scenes objects points 2"]  # m, equally spaced along the log
+    route_spacing: Float[Array, "scenes objects"]  # m between two route points
+    route_start: Float[Array, "scenes objects"]  # m, arc length at `current_step`
+    route_end: Float[Array, "scenes objects"]  # m, arc length at the log's end
+    light_position: Float[Array, "scenes lights 2"]  # m, the stop point
+    light_state: Int[Array, "scenes steps lights"]  # `LightState`
+    lights: Int[Array, " scenes"]  # lights of the scene
+    grid_origin: Float[Array, "scenes 2"]  # m
+    grid_shape: Int[Array, "scenes 2"]  # cells along x and y
+    cell_start: Int[Array, " scenes"]  # first row of `cell_rows`
+    fine_start: Int[Array, " scenes"]  # first element of `fine_state`
+    segment_start: Int[Array, " scenes"]  # first row of `segments`
+    segments: Float[Array, "segments 4"]  # m, x0 y0 x1 y1
+    segment_kind: Int[Array, " segments"]  # `RoadKind`
+    cell_rows: UInt[Array, "cells rows"]  # segments by distance, of the scene's own
+    cell_count: UInt[Array, " cells"]  # how many of them there are
+    fine_state: Int[Array, " fine"]  # -1 drivable, -2 not, else row of `fine_edges`
+    fine_edges: Int[Array, "mixed candidates"]  # rows of `edges`, repeated to fill
+    edges: Float[Array, "edges 10"]  # m, `sim.tables.Edges.packed`
+
+
+@dataclass(frozen=True)
+class BankFile:
+    """An opened bank. `arrays` are read-only views of the mapped file."""
+
+    path: Path
+    content_hash: str  # SHA-256 of the data, hexadecimal
+    scenario_ids: tuple[str, ...]
+    origins: tuple[tuple[float, float, float], ...]  # m, map frame
+    dt: float  # s
+    arrays: dict[str, np.ndarray]
+
+    @property
+    def scenes(self) -> int:
+        """Number of scenes."""
+        return len(self.scenario_ids)
+
+    @property
+    def bank(self) -> Bank:
+        """The arrays on JAX's default device (on a CPU: without a copy)."""
+        return Bank(**jax.device_put(self.arrays))
+
+
+def write_bank(
+    scenes: Iterable[Scene],
+    path: Path,
+    *,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Converts scenes and writes them under `path` only once the file is whole."""
+    converted, ids, origins, dts = [], [], [], set()
+    for scene in scenes:
+        converted.append(convert.convert(scene))
+        ids.append(scene.scenario_id)
+        origins.append(tuple(float(value) for value in convert.origin_of(scene)))
+        dts.add(round(scene.dt, 6))
+        if progress:
+            progress(len(converted))
+    if not converted:
+        raise BankError(f"{path}: no scene to write; name at least one scene")
+    if len(dts) > 1:
+        raise BankError(
+            f"{path}: scenes of different step lengths {sorted(dts)} s; "
+            "convert them into banks of their own"
+        )
+    arrays = convert.stack(converted)
+    _write_file(
+        path, arrays, {"scenario_ids": ids, "origins": origins, "dt": dts.pop()}
+    )
+
+
+def _write_file(
+    path: Path, arrays: dict[str, np.ndarray], description: dict[str, Any]
+) -> None:
+    digest = hashlib.sha256()
+    entries, offset = [], 0
+    for name in Bank._fields:
+        data = np.ascontiguousarray(arrays[name])
+        arrays[name] = data
+        digest.update(memoryview(data).cast("B") if data.size else b"")
+        entries.append(
+            {
+                "name": name,
+                "dtype": data.dtype.str,
+                "shape": data.shape,
+                "offset": offset,
+            }
+        )
+        offset += _aligned(data.nbytes)
+    header = json.dumps(
+        {
+            "version": VERSION,
+            "sha256": digest.hexdigest(),
+            "bytes": offset,
+            "arrays": entries,
+            **description,
+        }
+    ).encode()
+    start = _aligned(len(MAGIC) + 8 + len(header))
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(temporary, "wb") as file:
+            file.write(MAGIC + len(header).to_bytes(8, "little") + header)
+            for entry in entries:
+                file.seek(start + entry["offset"])
+                arrays[entry["name"]].tofile(file)
+            file.truncate(start + offset)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise BankError(f"cannot write bank {path}: {error.strerror}") from error
+
+
+def open_bank(path: Path) -> BankFile:
+    """Maps a bank. Costs milliseconds whatever its size; `verify` reads it whole."""
+    try:
+        with open(path, "rb") as file:
+            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "the file is empty"
+        raise BankError(
+            f"cannot open bank {path}: {reason}; make one with `slipstream scenes`"
+        ) from error
+    header, start = _read_header(path, mapped)
+    arrays = {}
+    for entry in header["arrays"]:
+        dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
+        count = int(np.prod(shape, dtype=np.int64))
+        flat = np.frombuffer(mapped, dtype, count, start + entry["offset"])
+        arrays[entry["name"]] = flat.reshape(shape)
+    if set(arrays) != set(Bank._fields):
+        raise BankError(f"bank {path} lacks arrays; convert its scenes again")
+    return BankFile(
+        path=path,
+        content_hash=header["sha256"],
+        scenario_ids=tuple(header["scenario_ids"]),
+        origins=tuple((x, y, z) for x, y, z in header["origins"]),
+        dt=float(header["dt"]),
+        arrays=arrays,
+    )
+
+
+def _read_header(path: Path, mapped: mmap.mmap) -> tuple[dict[str, Any], int]:
+    """The header and the byte offset at which the data start."""
+    if mapped[: len(MAGIC)] != MAGIC:
+        raise BankError(f"{path} is not a bank; make one with `slipstream scenes`")
+    length = int.from_bytes(mapped[8:16], "little")
+    if 16 + length > len(mapped):
+        raise BankError(
+            f"bank {path} is truncated at byte {len(mapped)}, within its header; "
+            "convert its scenes again"
+        )
+    try:
+        header = json.loads(mapped[16 : 16 + length])
+        version = header["version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise BankError(
+            f"bank {path}: broken header; convert its scenes again"
+        ) from error
+    if version != VERSION:
+        raise BankError(
+            f"bank {path} has version {version}, this program reads {VERSION}; "
+            "convert its scenes again"
+        )
+    start = _aligned(16 + length)
+    if len(mapped) != start + header["bytes"]:
+        raise BankError(
+            f"bank {path} is truncated: {len(mapped)} bytes of "
+            f"{start + header['bytes']}; convert its scenes again"
+        )
+    return header, start
+
+
+def verify(file: BankFile) -> None:
+    """Reads every byte and compares the hash; BankError if they differ."""
+    digest = hashlib.sha256()
+    for name in Bank._fields:
+        data = file.arrays[name]
+        digest.update(memoryview(data).cast("B") if data.size else b"")
+    if digest.hexdigest() != file.content_hash:
+        raise BankError(
+            f"bank {file.path} is damaged: its data hash to {digest.hexdigest()}, its "
+            f"header says {file.content_hash}; convert its scenes again"
+        )
+
+
+def is_bank(path: Path) -> bool:
+    """Whether the file begins as a bank does."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def _aligned(size: int) -> int:
+    return -(-size // ALIGNMENT) * ALIGNMENT
