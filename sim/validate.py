@@ -95,7 +95,7 @@ def _state_problems(scene: Scene) -> Iterator[str]:
     )
     for name, values, limit in limits:
         bad = ~_within(values, limit)
-        bad = bad.any(axis=-1) if bad.ndim == 3 else bad
+        bad = np.asarray(bad.any(axis=-1)) if bad.ndim == 3 else bad
         yield from _first(
             bad & scene.valid, f"{name} is not finite or beyond {limit:g}"
         )
