@@ -1,0 +1,112 @@
+"""The small messages, in msgpack: counters, status, the call to stop, files.
+
+Each is a tagged frozen struct with the wire's version; unknown fields, wrong types and
+truncated payloads are refused. Speed does not matter here: a handful a second.
+"""
+
+from typing import Annotated, TypeVar, final
+
+import msgspec
+
+from replay.wire import WIRE_VERSION, WireError
+
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Value = float | int | str
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What all of them carry."""
+
+    version: int = WIRE_VERSION
+
+
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+@final
+class WriterStats(Message, frozen=True, kw_only=True):
+    """What the service knows of one writer."""
+
+    writer: Count
+    epoch: Count  # of its current process
+    next_sequence: Count  # the one that will be accepted next
+    rows: Count  # stored from all its epochs
+    pending: Count  # batches waiting for the limiter
+
+
+@final
+class StatsReply(Message, frozen=True, kw_only=True, tag=True):
+    """The service's counters since it started."""
+
+    incarnation: Count  # of the service's process
+    schema_hash: bytes
+    capacity: Count  # rows
+    size: Count  # rows in the table now
+    inserts: Count  # rows
+    samples: Count  # rows
+    deletes: Count  # rows pushed out by newer ones
+    samples_per_insert: float  # samples / inserts; 0 before there are any
+    configured_samples_per_insert: float
+    min_size: Count
+    insert_wait_s: float  # total time that batches were held by the limiter
+    sample_wait_s: float
+    busy_inserts: Count  # requests answered "busy"
+    busy_samples: Count
+    duplicates: Count  # batches acknowledged again
+    gaps: Count  # batches refused because an earlier one is missing
+    refused: Count  # requests that can never be accepted
+    stale_updates: Count  # priorities for rows that were gone
+    pending_samples: Count
+    mean_priority_mass: float  # of the rows in the table
+    writers: list[WriterStats]
+
+
+@final
+class StatusMessage(Message, frozen=True, kw_only=True, tag=True):
+    """A role's own counters, for the console."""
+
+    role: str
+    values: dict[str, Value]
+
+
+@final
+class Stop(Message, frozen=True, kw_only=True, tag=True):
+    """Every role is to end cleanly."""
+
+    reason: str
+
+
+@final
+class FileRequest(Message, frozen=True, kw_only=True, tag=True):
+    """The part of a file that is wanted; `length` 0 asks for its size and hash."""
+
+    offset: Count
+    length: Count
+
+
+@final
+class FileReply(Message, frozen=True, kw_only=True, tag=True):
+    """A part of a file, and what the whole of it is."""
+
+    size: Count  # bytes of the whole file
+    sha256: str  # of the whole file, hexadecimal
+    data: bytes
+
+
+def encode(message: Message) -> bytes:
+    """The message as msgpack."""
+    return msgspec.msgpack.encode(message)
+
+
+def decode(payload: bytes, kind: type[MessageT]) -> MessageT:
+    """Parses and validates; raises `WireError`, never a half-read message."""
+    try:
+        message = msgspec.msgpack.decode(payload, type=kind)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise WireError(f"{kind.__name__}: {error}") from error
+    if message.version != WIRE_VERSION:
+        raise WireError(
+            f"{kind.__name__}: wire version {message.version}, this process speaks "
+            f"{WIRE_VERSION}; run the same release everywhere"
+        )
+    return message

@@ -1,0 +1,387 @@
+"""The messages: one frozen struct each, decoded whole or refused.
+
+Bulk messages (rows, priorities, weights) are a fixed little-endian header followed by
+arrays; small ones that nothing counts on for speed are msgpack (see
+`replay.control`). No pickle, and no length is used before it has been checked.
+
+Every header begins with the same 16 bytes:
+
+    magic "SLST" | version u16 | kind u16 | hash of the row's schema, 8 bytes
+
+and is padded to 64 bytes, so that rows behind it stay aligned.
+
+    Insert        writer u32, rows u32, epoch u64, sequence u64, base u64,
+                  hold ms u32; then rows
+    InsertReply   status u16, writer u32, epoch u64, next sequence u64,
+                  incarnation u64; then the reason as UTF-8
+    SampleRequest batch size u32, batches u32, updates u32, hold ms u32; then
+                  ids u64[updates], priorities f64[updates]
+    FetchRequest  limit u32, first id u64
+    SampleReply   status u16, rows u32, size u64, inserts u64; then ids u64[rows],
+                  probabilities f64[rows], rows; or the reason if refused. It also
+                  answers FetchRequest (size and inserts bound the ids that exist)
+    Weights       values u32, version i64, layout hash ASCII[24]; then f32[values]
+"""
+
+import enum
+import struct
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+from jaxtyping import Float, UInt8, UInt64
+
+from replay.spec import ReplayError, RowSpec, Sample
+
+WIRE_VERSION = 1
+MAGIC = b"SLST"
+HEADER_BYTES = 64
+MAX_ROWS = 1 << 20  # per message
+MAX_UPDATES = 1 << 20
+_COMMON = struct.Struct("<4sHH8s")
+_NO_SCHEMA = bytes(8)
+
+
+class WireError(ReplayError):
+    """A payload is not the message that it should be."""
+
+
+class Kind(enum.IntEnum):
+    """Which message a payload is."""
+
+    INSERT = 1
+    INSERT_REPLY = 2
+    SAMPLE_REQUEST = 3
+    SAMPLE_REPLY = 4
+    FETCH_REQUEST = 5
+    WEIGHTS = 6
+
+
+class Status(enum.IntEnum):
+    """What became of a request."""
+
+    OK = 0
+    BUSY = 1  # the rate limiter did not admit it in time; ask again
+    GAP = 2  # not the next sequence; go back to the one in the reply
+    STALE = 3  # a newer process writes under this number
+    REFUSED = 4  # it can never be accepted; the reason says why
+
+
+_INSERT = struct.Struct("<IIQQQI")
+_INSERT_REPLY = struct.Struct("<HxxIQQQ")
+_SAMPLE_REQUEST = struct.Struct("<IIII")
+_SAMPLE_REPLY = struct.Struct("<HxxIQQ")
+_FETCH_REQUEST = struct.Struct("<IxxxxQ")
+_WEIGHTS = struct.Struct("<Ixxxxq24s")
+
+
+def _header(kind: Kind, schema_hash: bytes, rest: bytes) -> bytes:
+    """The 64 bytes that begin a message."""
+    head = _COMMON.pack(MAGIC, WIRE_VERSION, kind, schema_hash) + rest
+    return head.ljust(HEADER_BYTES, b"\0")
+
+
+def _open(payload: bytes, kind: Kind, schema_hash: bytes) -> None:
+    """Checks the common header; raises `WireError` naming what differs."""
+    name = kind.name
+    if len(payload) < HEADER_BYTES:
+        raise WireError(f"{name}: {len(payload)} bytes, a header has {HEADER_BYTES}")
+    magic, version, got_kind, got_hash = _COMMON.unpack_from(payload)
+    if magic != MAGIC:
+        raise WireError(f"{name}: begins with {magic!r}, not {MAGIC!r}")
+    if version != WIRE_VERSION:
+        raise WireError(
+            f"{name}: wire version {version}, this process speaks {WIRE_VERSION}; "
+            "run the same release everywhere"
+        )
+    if got_kind != kind:
+        raise WireError(f"{name}: got a message of kind {got_kind}")
+    if got_hash != schema_hash:
+        raise WireError(
+            f"{name}: row schema {got_hash.hex()}, expected {schema_hash.hex()}; "
+            "actors, replay and learner must run with the same row layout"
+        )
+
+
+def _check_length(payload: bytes, kind: Kind, body: int) -> None:
+    """A body of exactly `body` bytes must follow the header."""
+    if len(payload) != HEADER_BYTES + body:
+        raise WireError(
+            f"{kind.name}: {len(payload) - HEADER_BYTES} bytes after the header, "
+            f"expected {body}"
+        )
+
+
+def _check_count(kind: Kind, what: str, count: int, most: int) -> None:
+    if not count <= most:
+        raise WireError(f"{kind.name}: {count} {what}, at most {most} are allowed")
+
+
+def _reason(payload: bytes, kind: Kind) -> str:
+    """The text that follows a reply's header."""
+    try:
+        return payload[HEADER_BYTES:].decode()
+    except UnicodeDecodeError as error:
+        raise WireError(f"{kind.name}: the reason is not UTF-8") from error
+
+
+def _status(value: int, kind: Kind) -> Status:
+    try:
+        return Status(value)
+    except ValueError as error:
+        raise WireError(f"{kind.name}: unknown status {value}") from error
+
+
+@final
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Insert:
+    """Writer to service: the batch `sequence` of a writer's life `epoch`."""
+
+    writer: int
+    epoch: int  # grows when the writer's process restarts
+    sequence: int
+    base: int  # the lowest sequence that the writer knows no acknowledgement of
+    hold_ms: int  # the service may hold its answer so long
+    rows: UInt8[np.ndarray, "rows row_bytes"]
+
+    def encode(self, spec: RowSpec) -> bytes:
+        """Header, then the rows' bytes."""
+        head = _INSERT.pack(
+            self.writer,
+            len(self.rows),
+            self.epoch,
+            self.sequence,
+            self.base,
+            self.hold_ms,
+        )
+        return _header(Kind.INSERT, spec.schema_hash, head) + self.rows.tobytes()
+
+    @staticmethod
+    def decode(payload: bytes, spec: RowSpec) -> "Insert":
+        """Parses and checks; the rows are a view of the payload."""
+        _open(payload, Kind.INSERT, spec.schema_hash)
+        writer, count, epoch, sequence, base, hold_ms = _INSERT.unpack_from(
+            payload, _COMMON.size
+        )
+        _check_count(Kind.INSERT, "rows", count, MAX_ROWS)
+        _check_length(payload, Kind.INSERT, count * spec.row_bytes)
+        if count == 0 or base > sequence:
+            raise WireError(
+                f"INSERT: {count} rows as sequence {sequence} after {base}; a batch "
+                "has rows and follows what it builds on"
+            )
+        rows = np.frombuffer(payload, np.uint8, offset=HEADER_BYTES)
+        return Insert(
+            writer=writer,
+            epoch=epoch,
+            sequence=sequence,
+            base=base,
+            hold_ms=hold_ms,
+            rows=rows.reshape(count, spec.row_bytes),
+        )
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class InsertReply:
+    """Service to writer: all below `next_sequence` is stored."""
+
+    status: Status
+    writer: int
+    epoch: int
+    next_sequence: int
+    incarnation: int  # of the service's process; changes when it restarts
+    reason: str = ""
+
+    def encode(self, spec: RowSpec) -> bytes:
+        """Header, then the reason."""
+        head = _INSERT_REPLY.pack(
+            self.status, self.writer, self.epoch, self.next_sequence, self.incarnation
+        )
+        return _header(Kind.INSERT_REPLY, spec.schema_hash, head) + self.reason.encode()
+
+    @staticmethod
+    def decode(payload: bytes, spec: RowSpec) -> "InsertReply":
+        """Parses and checks."""
+        _open(payload, Kind.INSERT_REPLY, spec.schema_hash)
+        status, writer, epoch, next_sequence, incarnation = _INSERT_REPLY.unpack_from(
+            payload, _COMMON.size
+        )
+        return InsertReply(
+            status=_status(status, Kind.INSERT_REPLY),
+            writer=writer,
+            epoch=epoch,
+            next_sequence=next_sequence,
+            incarnation=incarnation,
+            reason=_reason(payload, Kind.INSERT_REPLY),
+        )
+
+
+@final
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampleRequest:
+    """Learner to service: new priorities first, then draw `batches` batches."""
+
+    batch_size: int
+    batches: int
+    hold_ms: int
+    ids: UInt64[np.ndarray, " updates"]
+    priorities: Float[np.ndarray, " updates"]  # float64, >= 0: |TD error|
+
+    def encode(self, spec: RowSpec) -> bytes:
+        """Header, ids, priorities."""
+        head = _SAMPLE_REQUEST.pack(
+            self.batch_size, self.batches, len(self.ids), self.hold_ms
+        )
+        return (
+            _header(Kind.SAMPLE_REQUEST, spec.schema_hash, head)
+            + self.ids.astype("<u8").tobytes()
+            + self.priorities.astype("<f8").tobytes()
+        )
+
+    @staticmethod
+    def decode(payload: bytes, spec: RowSpec) -> "SampleRequest":
+        """Parses and checks."""
+        kind = Kind.SAMPLE_REQUEST
+        _open(payload, kind, spec.schema_hash)
+        batch_size, batches, updates, hold_ms = _SAMPLE_REQUEST.unpack_from(
+            payload, _COMMON.size
+        )
+        _check_count(kind, "updates", updates, MAX_UPDATES)
+        _check_count(kind, "rows asked for", batch_size * batches, MAX_ROWS)
+        _check_length(payload, kind, 16 * updates)
+        if batch_size * batches == 0:
+            raise WireError(f"{kind.name}: {batches} batches of {batch_size} rows")
+        return SampleRequest(
+            batch_size=batch_size,
+            batches=batches,
+            hold_ms=hold_ms,
+            ids=np.frombuffer(payload, "<u8", updates, HEADER_BYTES),
+            priorities=np.frombuffer(
+                payload, "<f8", updates, HEADER_BYTES + 8 * updates
+            ),
+        )
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class FetchRequest:
+    """Anyone to service: up to `limit` rows with ids from `first_id`, in order."""
+
+    first_id: int
+    limit: int
+
+    def encode(self, spec: RowSpec) -> bytes:
+        """A header only."""
+        head = _FETCH_REQUEST.pack(self.limit, self.first_id)
+        return _header(Kind.FETCH_REQUEST, spec.schema_hash, head)
+
+    @staticmethod
+    def decode(payload: bytes, spec: RowSpec) -> "FetchRequest":
+        """Parses and checks."""
+        _open(payload, Kind.FETCH_REQUEST, spec.schema_hash)
+        limit, first_id = _FETCH_REQUEST.unpack_from(payload, _COMMON.size)
+        _check_count(Kind.FETCH_REQUEST, "rows asked for", limit, MAX_ROWS)
+        _check_length(payload, Kind.FETCH_REQUEST, 0)
+        return FetchRequest(first_id=first_id, limit=limit)
+
+
+@final
+class SampleReplyBuffer:
+    """A sample reply under construction: the table gathers straight into it."""
+
+    def __init__(self, *, spec: RowSpec, count: int) -> None:
+        """Reserves a header, ids, probabilities and rows for `count` rows."""
+        self._spec = spec
+        self.payload = bytearray(HEADER_BYTES + count * (16 + spec.row_bytes))
+        start = HEADER_BYTES
+        self.ids = np.frombuffer(self.payload, "<u8", count, start)
+        self.probabilities = np.frombuffer(
+            self.payload, "<f8", count, start + 8 * count
+        )
+        rows = np.frombuffer(self.payload, np.uint8, offset=start + 16 * count)
+        self.rows = rows.reshape(count, spec.row_bytes)
+
+    def seal(self, *, size: int, inserts: int) -> bytearray:
+        """Writes the header and returns the whole message."""
+        head = _SAMPLE_REPLY.pack(Status.OK, len(self.ids), size, inserts)
+        self.payload[:HEADER_BYTES] = _header(
+            Kind.SAMPLE_REPLY, self._spec.schema_hash, head
+        )
+        return self.payload
+
+
+def encode_sample_refusal(status: Status, reason: str, spec: RowSpec) -> bytes:
+    """A sample reply without rows: busy, or refused with a reason."""
+    head = _SAMPLE_REPLY.pack(status, 0, 0, 0)
+    return _header(Kind.SAMPLE_REPLY, spec.schema_hash, head) + reason.encode()
+
+
+@final
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampleReply:
+    """Service to learner: rows, or why there are none."""
+
+    status: Status
+    reason: str
+    sample: Sample | None  # None if and only if status is not OK
+
+    @staticmethod
+    def decode(payload: bytes, spec: RowSpec) -> "SampleReply":
+        """Parses and checks; the arrays are views of the payload."""
+        kind = Kind.SAMPLE_REPLY
+        _open(payload, kind, spec.schema_hash)
+        value, count, size, inserts = _SAMPLE_REPLY.unpack_from(payload, _COMMON.size)
+        status = _status(value, kind)
+        if status is not Status.OK:
+            return SampleReply(
+                status=status, reason=_reason(payload, kind), sample=None
+            )
+        _check_count(kind, "rows", count, MAX_ROWS)
+        _check_length(payload, kind, count * (16 + spec.row_bytes))
+        start = HEADER_BYTES
+        sample = Sample(
+            ids=np.frombuffer(payload, "<u8", count, start),
+            probabilities=np.frombuffer(payload, "<f8", count, start + 8 * count),
+            rows=np.frombuffer(payload, spec.dtype, count, start + 16 * count),
+            size=size,
+            inserts=inserts,
+        )
+        return SampleReply(status=status, reason="", sample=sample)
+
+
+@final
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Weights:
+    """Learner to actors: all parameters in the layout's order."""
+
+    version: int  # updates made; -1 before there are any
+    layout_hash: str  # of names and shapes, at most 24 ASCII characters
+    vector: Float[np.ndarray, " parameters"]  # float32
+
+    def encode(self) -> bytes:
+        """Header, then the vector."""
+        name = self.layout_hash.encode("ascii", "replace")
+        if not 0 < len(name) <= 24:
+            raise WireError(
+                f"layout hash {self.layout_hash!r}: needs 1 to 24 ASCII characters"
+            )
+        head = _WEIGHTS.pack(len(self.vector), self.version, name)
+        return (
+            _header(Kind.WEIGHTS, _NO_SCHEMA, head)
+            + self.vector.astype("<f4").tobytes()
+        )
+
+    @staticmethod
+    def decode(payload: bytes) -> "Weights":
+        """Parses and checks; the vector is its own copy."""
+        _open(payload, Kind.WEIGHTS, _NO_SCHEMA)
+        count, version, name = _WEIGHTS.unpack_from(payload, _COMMON.size)
+        _check_length(payload, Kind.WEIGHTS, 4 * count)
+        try:
+            layout_hash = name.rstrip(b"\0").decode("ascii")
+        except UnicodeDecodeError as error:
+            raise WireError("WEIGHTS: the layout hash is not ASCII") from error
+        # A copy: jax.device_put may alias memory, and the payload is Zenoh's.
+        vector = np.frombuffer(payload, "<f4", count, HEADER_BYTES).copy()
+        return Weights(version=version, layout_hash=layout_hash, vector=vector)
