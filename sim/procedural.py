@@ -22,8 +22,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sim.procedural_checks import EdgeMap, box_corners, coasts_into, overlaps
+from sim.procedural_crossing import crossing
 from sim.procedural_geometry import headings, resample
 from sim.procedural_map import Frame, Layout
+from sim.procedural_merge import merge
 from sim.procedural_population import draw_size, populate
 from sim.procedural_roads import curved_road
 from sim.procedural_traffic import DT, Fleet, Motion, simulate
@@ -37,8 +39,8 @@ _EDGE_MARGIN = 0.1  # m that logged boxes stay inside the road edges at least
 _AHEAD = 160.0  # m of road that the recording vehicle has after `CURRENT_STEP`
 _LEAST, _MOST = 8, 24  # objects
 _HARD_SHARE = 0.75
-_FAMILIES = (curved_road,)
-_FAMILY_SHARES = (1.0,)
+_FAMILIES = (curved_road, crossing, merge)
+_FAMILY_SHARES = (0.35, 0.4, 0.25)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,6 +6,7 @@ on the left; between them a double yellow line or a median island. A parking bay
 widen either side.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,12 +24,12 @@ from sim.scene import ObjectType, RoadKind
 
 _BAY = 2.5  # m, width of a parking bay
 _SLOT = 6.6  # m, length of a parking slot
-_GUTTER = 0.4  # m between the outermost lane and the road edge
+GUTTER = 0.4  # m between the outermost lane and the road edge
 _SECTION = 110.0  # m, length of a lane feature before the next one
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Profile:
+class Profile:
     """A cross-section: everything in metres, one way if there is no oncoming lane."""
 
     forward: int
@@ -67,9 +68,10 @@ def winding(
 
 def curved_road(rng: np.random.Generator, steps: int) -> Layout:
     """Draws a layout of this family."""
-    road = winding(rng, 430.0, 32.0, 160.0)
+    tightest, widest = (32.0, 160.0) if rng.random() < 0.55 else (250.0, 2500.0)
+    road = winding(rng, 430.0, tightest, widest)
     oncoming = int(rng.integers(0, 4)) if rng.random() < 0.8 else 0
-    profile = _Profile(
+    profile = Profile(
         forward=int(rng.integers(1, 4)),
         oncoming=oncoming,
         lane=rng.uniform(3.4, 3.8),
@@ -84,14 +86,13 @@ def curved_road(rng: np.random.Generator, steps: int) -> Layout:
     for is_oncoming in (False, True)[: 1 + (oncoming > 0)]:
         _lanes(builder, road, profile, limit, is_oncoming)
         _drive(rng, road, profile, limit, is_oncoming, paths, sources)
-        edge, slots = _kerb(rng, road, profile, is_oncoming)
+        edge, slots = kerb(rng, road, profile, is_oncoming, (60.0, 350.0))
         builder.trace(RoadKind.EDGE_BOUNDARY, edge)
         parking.append(slots)
-        sidewalks.append(road.offset(profile.side(oncoming=is_oncoming) * 1.0))
         outward = 5.0 if is_oncoming else -5.0
-        sidewalks[-1] = road.offset(profile.side(oncoming=is_oncoming) + outward)
+        sidewalks.append(road.offset(profile.side(oncoming=is_oncoming) + outward))
     if not oncoming:
-        builder.trace(RoadKind.EDGE_BOUNDARY, road.offset(_GUTTER)[::-1])
+        builder.trace(RoadKind.EDGE_BOUNDARY, road.offset(GUTTER)[::-1])
     return Layout(
         family="curved",
         map=builder,
@@ -105,7 +106,7 @@ def curved_road(rng: np.random.Generator, steps: int) -> Layout:
     )
 
 
-def _mark(builder: MapBuilder, road: Reference, profile: _Profile) -> None:
+def _mark(builder: MapBuilder, road: Reference, profile: Profile) -> None:
     """Paints the lines and builds the median island."""
     for count, oncoming in ((profile.forward, False), (profile.oncoming, True)):
         for index in range(1, count):
@@ -139,7 +140,7 @@ def island(
 def _lanes(
     builder: MapBuilder,
     road: Reference,
-    profile: _Profile,
+    profile: Profile,
     limit: float,
     oncoming: bool,
 ) -> None:
@@ -148,22 +149,21 @@ def _lanes(
     for index in range(profile.oncoming if oncoming else profile.forward):
         centre = profile.centre(index, oncoming=oncoming)
         sections = [
-            road.span(centre, low, high)
-            for low, high in zip(cuts[:-1], cuts[1:], strict=True)
+            road.span(centre, low, high) for low, high in itertools.pairwise(cuts)
         ]
         if oncoming:
             sections = [section[::-1] for section in reversed(sections)]
         ids = [
             builder.trace(RoadKind.LANE_STREET, section, limit) for section in sections
         ]
-        for first, second in zip(ids[:-1], ids[1:], strict=True):
+        for first, second in itertools.pairwise(ids):
             builder.join(first, second)
 
 
 def _drive(
     rng: np.random.Generator,
     road: Reference,
-    profile: _Profile,
+    profile: Profile,
     limit: float,
     oncoming: bool,
     paths: list[DrivingPath],
@@ -202,25 +202,29 @@ def _drive(
         paths.append(driving_path(road.offset(left)[walk], limit))
 
 
-def _kerb(
-    rng: np.random.Generator, road: Reference, profile: _Profile, oncoming: bool
+def kerb(
+    rng: np.random.Generator,
+    road: Reference,
+    profile: Profile,
+    oncoming: bool,
+    within: tuple[float, float],
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "slots 3"]]:
     """The road edge of one direction, perhaps with a parking bay and its slots."""
     side = profile.side(oncoming=oncoming)
     outward = np.sign(side)
     along = road.stations()
-    width = np.full(len(along), _GUTTER)
+    width = np.full(len(along), GUTTER)
     slots = np.zeros((0, 3))
     if rng.random() < 0.5:
         count = int(rng.integers(3, 9))
-        low = rng.uniform(60.0, road.length - 150.0)
+        low = rng.uniform(within[0], within[1] - count * _SLOT)
         high = low + count * _SLOT
         taper = 5.0
         rise = np.minimum((along - low + taper) / taper, (high + taper - along) / taper)
         width = width + np.clip(rise, 0.0, 1.0) * _BAY
         at = low + _SLOT * (np.arange(count) + 0.5)
         index = np.round(at / STEP).astype(np.int64)
-        middle = road.offset(side + outward * (_GUTTER + _BAY / 2))[index]
+        middle = road.offset(side + outward * (GUTTER + _BAY / 2))[index]
         yaw = road.yaw[index] + (np.pi if oncoming else 0.0)
         slots = np.concatenate([middle, yaw[:, None]], axis=-1)
     edge = road.offset(side + outward * width)

@@ -2,7 +2,8 @@
 
 Longitudinal law, every `CONTROL` s, with the accelerations held in between:
 
-    a = min(free, a_0 (1 - (s* / gap)^2)),   s* = s_0 + max(0, v T + v dv / 2 sqrt(a_0 b))
+    a = min(free, a_0 (1 - (s* / gap)^2))
+    s* = s_0 + max(0, v T + v dv / (2 sqrt(a_0 b)))
 
 the Intelligent Driver Model (Treiber, Hennecke, Helbing, Phys. Rev. E 62, 2000) with
 a free term that also tracks a falling speed profile. The gap is the smallest to:
@@ -132,7 +133,9 @@ class _Drive:
     def __init__(self, layout: Layout, fleet: Fleet) -> None:
         """Gathers the per-vehicle and per-pair constants."""
         self.fleet = fleet
-        self.tables = tabulate(layout.paths)
+        used, own = np.unique(fleet.path, return_inverse=True)
+        self.tables = tabulate(tuple(layout.paths[p] for p in used))
+        self.own = own
         paths = [layout.paths[p] for p in fleet.path]
         self.signals = layout.signals
         self.zipper = layout.zipper
@@ -140,15 +143,16 @@ class _Drive:
         self.stop = np.array([path.stop for path in paths])
         self.end = np.array([path.length for path in paths])
         self.grid = np.array([p.step * max(1, round(_GRID / p.step)) for p in paths])
-        self.rank = np.array([1000.0 * p.rank for p in paths]) + np.arange(len(paths))
+        self.rank = np.array([1000.0 * p.rank for p in paths])
+        self.rank += 0.001 * np.arange(len(paths))
         self.pending = np.array([path.must_stop for path in paths])
         self.arrival = np.full(len(paths), np.inf)
         self.length, self.width = fleet.size[:, 0], fleet.size[:, 1]
-        self.row, self.column = fleet.path[:, None], fleet.path[None, :]
+        self.row, self.column = own[:, None], own[None, :]
         self.enter = self.tables.enter[self.row, self.column]
         self.leave = self.tables.leave[self.row, self.column]
         self.crosses = bool((self.enter < _FAR).any())
-        self.reach = np.minimum(self.leave, self.enter + 25.0)
+        self.reach = np.minimum(self.leave, self.enter + 12.0)
         self.walker = fleet.kind == ObjectType.PEDESTRIAN
         self.itself = np.eye(len(paths), dtype=bool)
 
@@ -181,7 +185,7 @@ class _Drive:
         k = ((s + 0.5 * v) / self.grid).astype(np.int64)
         k = np.minimum(k, self.tables.speed.shape[1] - 1)
         slow = (fleet.slow_from <= step * DT) & (step * DT < fleet.slow_until)
-        desired = self.tables.speed[fleet.path, k] * fleet.desired
+        desired = self.tables.speed[self.own, k] * fleet.desired
         desired = np.minimum(desired, fleet.cap)
         desired = desired * np.where(slow, fleet.slow_factor, 1.0)
         below = 1.8 * (1 - (v / np.maximum(desired, 0.1)) ** 4)
@@ -270,7 +274,7 @@ class _Drive:
         # The one with the right of way may be slower than it could be.
         latest = np.maximum(clear, 0.0) / np.maximum(v, 2.5)[:, None]
         meet = (early < latest.T + 1.2) & (early.T < late + 1.2)
-        order = np.where(np.isinf(self.arrival), self.rank, self.arrival)
+        order = self.rank + np.minimum(self.arrival, 500.0)
         goes = (order[None, :] < order[:, None]) & ~held[None, :]
         inside = (entry.T <= 0) & (clear.T > 0)
         possible = v[:, None] ** 2 < 2 * 5.0 * np.maximum(entry - 0.3, 0.01)
