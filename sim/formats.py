@@ -27,6 +27,10 @@ _GZIP_MAGIC = b"\x1f\x8b"
 _MARK = b"\xef\xbb\xbf"  # of UTF-8; some editors put it before JSON
 
 
+class UnsupportedFormat(SceneError):
+    """A file is no scene at all; a damaged one is another `SceneError`."""
+
+
 class Format(enum.Enum):
     """The kinds of file that can be told apart."""
 
@@ -53,38 +57,46 @@ def detect(path: Path) -> Format:
     if head.removeprefix(_MARK).lstrip().startswith(b"{"):
         if b'"objects"' in _read_bytes(path):
             return Format.GPUDRIVE
-        raise SceneError(f"{path}: JSON without objects; supported are {SUPPORTED}")
-    raise SceneError(f"{path}: {_refusal(path, head)}")
+        raise UnsupportedFormat(
+            f"{path}: JSON without objects; supported are {SUPPORTED}"
+        )
+    raise _refusal(path, head)
 
 
 def _detect_record(path: Path) -> Format:
-    """Which message the first readable record of a TFRecord holds."""
-    problem: SceneError | None = None
+    """Which message the first readable record of a TFRecord holds.
+
+    Where none is readable the answer makes no difference: reading reports each.
+    """
     for record in tfrecord.read_records(path):
+        if isinstance(record, tfrecord.Record) and is_example(record.payload):
+            return Format.WOMD_EXAMPLE
         if isinstance(record, tfrecord.Record):
-            example = is_example(record.payload)
-            return Format.WOMD_EXAMPLE if example else Format.WOMD_SCENARIO
-        problem = problem or record
-    raise problem or SceneError(f"{path}: holds no record")
+            break
+    return Format.WOMD_SCENARIO
 
 
-def _refusal(path: Path, head: bytes) -> str:
+def _refusal(path: Path, head: bytes) -> SceneError:
     """Why a file whose content is not recognised is refused."""
     if not head:
-        return "is empty; fetch it again"
+        return UnsupportedFormat(f"{path}: is empty; fetch it again")
     if head.startswith(_GZIP_MAGIC):
-        return "is compressed by gzip; unpack it first"
-    if "tfrecord" in path.name.lower():
-        if len(head) < tfrecord.HEADER_BYTES:
-            return (
-                f"truncated at byte {len(head)}: the record at byte 0 needs more; "
-                "fetch the file again"
-            )
-        return (
-            "CRC mismatch of the record length at byte 0; fetch the file again, or "
-            f"give one of the supported formats: {SUPPORTED}"
+        return UnsupportedFormat(f"{path}: is compressed by gzip; unpack it first")
+    # The name decides only about the message: what damage has made of a recording's
+    # first bytes cannot be recognised.
+    if "tfrecord" not in path.name.lower():
+        return UnsupportedFormat(
+            f"{path}: is of no supported format; supported are {SUPPORTED}"
         )
-    return f"is of no supported format; supported are {SUPPORTED}"
+    if len(head) < tfrecord.HEADER_BYTES:
+        return SceneError(
+            f"{path}: truncated at byte {len(head)}: the record at byte 0 needs "
+            "more; fetch the file again"
+        )
+    return SceneError(
+        f"{path}: CRC mismatch of the record length at byte 0; fetch the file again, "
+        f"or give one of the supported formats: {SUPPORTED}"
+    )
 
 
 def list_files(
@@ -119,17 +131,14 @@ def _scene_files(folder: Path, on_skip: Callable[[str], None] | None) -> Iterabl
 def _is_scene_file(file: Path, on_skip: Callable[[str], None] | None) -> bool:
     """Whether to read a file that lies in a folder; tells `on_skip` if not."""
     try:
-        format_ = detect(file)
-    except SceneError as error:
-        # A damaged recording is no reason to pass over it in silence: reading it
-        # reports the place of the damage.
-        if "tfrecord" in file.name.lower():
-            return True
-        reason = str(error)
-    else:
-        if format_ is not Format.BANK:
+        if detect(file) is not Format.BANK:
             return True
         reason = f"{file}: is a bank"
+    except UnsupportedFormat as error:
+        reason = str(error)
+    except SceneError:
+        # Damage is not passed over in silence: reading the file reports its place.
+        return True
     if on_skip is not None:
         on_skip(reason)
     return False

@@ -36,7 +36,7 @@ from sim.validate import check_scene
 
 _DT = 0.1  # s
 
-_MESSAGES = build_messages(
+MESSAGES = build_messages(
     "tensorflow",
     {
         "BytesList": (("value", 1, "bytes*"),),
@@ -100,7 +100,9 @@ def parse_example(payload: bytes, *, source: str) -> Scene:
             dt=_DT,
             current_step=past,
             sdc_index=_flagged(features, "state/is_sdc", kept, source, default=-1)[0],
-            object_ids=_ints(_get(features, "state/id", source), slots, source)[kept],
+            object_ids=_ints(
+                _get(features, "state/id", source), slots, "state/id", source
+            )[kept],
             object_types=_object_types(features, kept, source),
             position=states[..., 1:4],
             yaw=states[..., 4],
@@ -119,7 +121,7 @@ def parse_example(payload: bytes, *, source: str) -> Scene:
 
 def _features(payload: bytes, source: str) -> _Features:
     """The record's arrays by name."""
-    example: _Proto = _MESSAGES["Example"]()
+    example: _Proto = MESSAGES["Example"]()
     try:
         example.ParseFromString(payload)
     except DecodeError as error:
@@ -180,13 +182,16 @@ def _timeline(
         columns.append(np.concatenate(parts, axis=1).astype(np.float64))
     if len({column.shape for column in columns}) != 1:
         raise SceneError(f"{source}: the {group} features are of different lengths")
+    if not np.isfinite(columns[0]).all():
+        raise SceneError(f"{source}: {group}/*/{names[0]} is not finite")
     return np.stack(columns, axis=-1)
 
 
-def _ints(values: np.ndarray, count: int, source: str) -> np.ndarray:
+def _ints(values: np.ndarray, count: int, name: str, source: str) -> np.ndarray:
     """Whole numbers, which the form stores as floats in places."""
-    if values.size != count or not np.isfinite(values).all():
-        raise SceneError(f"{source}: {values.size} ids or types, expected {count}")
+    # Beyond 2^53 a float is no id, and the conversion would be undefined.
+    if values.size != count or not (np.abs(values) < 2.0**53).all():
+        raise SceneError(f"{source}: {name} is not {count} whole numbers")
     return values.astype(np.int64)
 
 
@@ -198,9 +203,8 @@ def _flagged(
     default: int | None = None,
 ) -> tuple[int, ...]:
     """Which of the kept objects a 0/1 feature (-1 in empty slots) marks."""
-    flags = _get(features, name, source)
-    if kept.size and flags.size <= kept.max():
-        raise SceneError(f"{source}: {name} has {flags.size} values only")
+    slots = _get(features, "state/type", source).size
+    flags = _ints(_get(features, name, source), slots, name, source)
     marked = tuple(int(i) for i in np.flatnonzero(flags[kept] == 1))
     return marked if marked or default is None else (default,)
 
@@ -208,7 +212,7 @@ def _flagged(
 def _object_types(features: _Features, kept: np.ndarray, source: str) -> np.ndarray:
     """The kept objects' types, which must be known."""
     values = _get(features, "state/type", source)
-    types = _ints(values, values.size, source)[kept]
+    types = _ints(values, values.size, "state/type", source)[kept]
     if not np.isin(types, list(ObjectType)).all():
         raise SceneError(f"{source}: an object is of an unknown type")
     return types
@@ -217,13 +221,13 @@ def _object_types(features: _Features, kept: np.ndarray, source: str) -> np.ndar
 def _roads(features: _Features, source: str) -> tuple[Polyline, ...]:
     """The runs of valid map points that share an id and a type."""
     group = "roadgraph_samples"
+    points = _get(features, f"{group}/xyz", source).astype(np.float64)
     valid, ids, kinds = (
-        _get(features, f"{group}/{name}", source).reshape(-1)
+        _ints(_get(features, f"{group}/{name}", source), points.size // 3, name, source)
         for name in ("valid", "id", "type")
     )
-    points = _get(features, f"{group}/xyz", source).astype(np.float64)
-    if not valid.size == ids.size == kinds.size == points.size / 3:
-        raise SceneError(f"{source}: the {group} features are of different lengths")
+    if points.size % 3:
+        raise SceneError(f"{source}: {group}/xyz has {points.size} values")
     use = valid > 0
     points, ids, kinds = points.reshape(-1, 3)[use], ids[use], kinds[use]
     unknown = ~np.isin(kinds, list(RoadKind))
@@ -257,4 +261,5 @@ def _lights(
     states[rows, np.nonzero(seen)[1]] = np.where(
         np.isin(values, list(LightState)), values, 0
     )
-    return TrafficLights(lanes.astype(np.int64), table[seen][first][:, 3:6], states)
+    lane_ids = _ints(lanes, len(lanes), "traffic_light_state/*/id", source)
+    return TrafficLights(lane_ids, table[seen][first][:, 3:6], states)
