@@ -1,0 +1,227 @@
+"""The learner learns, copies its target on time, and repeats itself exactly."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from actors.network import NetworkConfig
+from learner.learner import Batch, Learner, LearnerConfig, UpdateResult, learn
+from learner.network import to_vector
+from sim.observation import Observation, ObservationSizes
+
+SIZES = ObservationSizes(
+    ego=4, neighbours=3, agent=5, rows=4, road=3, lights=1, light=2
+)
+ACTIONS = 4
+NETWORK = NetworkConfig(width=16, heads=2, latents=2, mlp_width=32, mlp_layers=2)
+
+
+def make_learner(**fields):
+    config = LearnerConfig(**{"loss": "plain", "learning_rate": 1e-3, **fields})
+    return Learner(config=config, network=NETWORK, sizes=SIZES, actions=ACTIONS)
+
+
+def make_observations(batch, rng):
+    def features(*shape):
+        return rng.standard_normal((batch, *shape)).astype(np.float32)
+
+    def mask(count):
+        return rng.random((batch, count)) < 0.7
+
+    return Observation(
+        ego=features(SIZES.ego),
+        agents=features(SIZES.neighbours, SIZES.agent),
+        agents_valid=mask(SIZES.neighbours),
+        road=features(SIZES.rows, SIZES.road),
+        road_valid=mask(SIZES.rows),
+        lights=features(SIZES.lights, SIZES.light),
+        lights_valid=mask(SIZES.lights),
+    )
+
+
+def make_batches(seed=0, batch=32):
+    """Random transitions for ever."""
+    rng = np.random.default_rng(seed)
+    while True:
+        yield Batch(
+            observation_tm1=make_observations(batch, rng),
+            a_tm1=rng.integers(0, ACTIONS, batch).astype(np.int32),
+            r_t=rng.standard_normal(batch).astype(np.float32),
+            discount_t=(rng.random(batch) < 0.9).astype(np.float32),
+            observation_t=make_observations(batch, rng),
+            probabilities=rng.random(batch) + 0.01,
+        )
+
+
+def test_solves_a_bandit_with_context():
+    """One step, then the end: Q is the reward, 1 for the action the ego names."""
+    rng = np.random.default_rng(0)
+    learner = make_learner()
+    for _ in range(300):
+        batch = next(make_batches(int(rng.integers(1 << 30)), 64))
+        right = batch.observation_tm1.ego.argmax(axis=1)
+        learner.update(
+            batch._replace(
+                r_t=(batch.a_tm1 == right).astype(np.float32),
+                discount_t=np.zeros(64, np.float32),
+            )
+        )
+    unseen = next(make_batches(99, 256))
+    right = unseen.observation_tm1.ego.argmax(axis=1)
+    reward = (unseen.a_tm1 == right).astype(np.float32)
+    result = learner.update(
+        unseen._replace(r_t=reward, discount_t=np.zeros(256, np.float32))
+    )
+    assert np.mean(result.priorities) < 0.2  # guessing the mean gives 0.375
+    assert result.max_q == pytest.approx(1.0, abs=0.15)
+
+
+def test_bootstraps_to_the_geometric_sum():
+    """Reward 1 for ever at discount 0.5: every value is 2."""
+    learner = make_learner(discount=0.5, target_period=10)
+    batch = next(make_batches())
+    batch = batch._replace(
+        r_t=np.ones(32, np.float32),
+        discount_t=np.ones(32, np.float32),
+        observation_t=batch.observation_tm1,
+    )
+    for _ in range(400):
+        result = learner.update(batch)
+    assert result.mean_q == pytest.approx(2.0, abs=0.1)
+
+
+def test_target_is_copied_every_period_exactly():
+    learner, previous = make_learner(target_period=3), None
+    for count, batch in zip(range(1, 10), make_batches(), strict=False):
+        previous = to_vector(learner.target)
+        learner.update(batch)
+        target = to_vector(learner.target)
+        if count % 3 == 0:
+            np.testing.assert_array_equal(target, learner.vector())
+            assert (target != previous).any()
+        else:
+            np.testing.assert_array_equal(target, previous)
+            assert (target != learner.vector()).any()
+
+
+def losses_of(learner, updates=5):
+    batches = itertools.islice(make_batches(), updates)
+    return [learner.update(batch).loss for batch in batches]
+
+
+@pytest.mark.parametrize("loss", ["plain", "torchrl"])
+def test_same_seed_same_losses(loss):
+    first = losses_of(make_learner(loss=loss))
+    assert first == losses_of(make_learner(loss=loss))
+    assert first != losses_of(make_learner(loss=loss, seed=1))
+
+
+def test_torchrl_and_plain_train_alike():
+    plain, theirs = make_learner(loss="plain"), make_learner(loss="torchrl")
+    np.testing.assert_allclose(losses_of(plain), losses_of(theirs), rtol=1e-4)
+    np.testing.assert_allclose(plain.vector(), theirs.vector(), atol=1e-4)
+
+
+def test_rewards_are_clipped():
+    batch = next(make_batches())
+    sign = np.where(np.arange(32) % 2, 1, -1).astype(np.float32)
+    results = [
+        make_learner().update(batch._replace(r_t=sign * size)).loss
+        for size in (np.float32(1), np.float32(50))
+    ]
+    assert results[0] == results[1]
+
+
+def test_configured_discount_multiplies_the_rows():
+    """A discount of 0 makes every state terminal."""
+    batch = next(make_batches())
+    ended = batch._replace(discount_t=np.zeros(32, np.float32))
+    # The first head is small; a reward-sized difference needs values of that size.
+    learners = [make_learner(discount=0.0), make_learner(discount=0.9)]
+    assert learners[0].update(batch).loss == learners[1].update(ended).loss
+
+
+def test_rare_rows_weigh_most():
+    """A row drawn 1,000 times as often hardly moves the network."""
+    batch = next(make_batches())
+    probabilities = np.full(32, 1.0)
+    probabilities[0] = 1e-3
+    heavy = make_learner(importance_exponent=1.0)
+    result = heavy.update(batch._replace(probabilities=probabilities))
+    losses = np.where(
+        result.priorities < 1, result.priorities**2 / 2, result.priorities - 0.5
+    )
+    weights = np.where(np.arange(32) == 0, 1.0, 1e-3)
+    assert result.loss == pytest.approx(np.mean(weights * losses), rel=1e-4)
+
+
+def test_gradients_are_clipped_only_on_request():
+    batch = next(make_batches())
+    assert np.isnan(make_learner().update(batch).gradient_norm)
+    clipped = make_learner(max_gradient_norm=1e-3)
+    assert clipped.update(batch).gradient_norm > 1e-3
+    total = sum(float(p.grad.square().sum()) for p in clipped.network.parameters())
+    assert total**0.5 == pytest.approx(1e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("fields", "match"),
+    [
+        ({"learning_rate": 0.0}, "learning_rate=0.0 must be above 0"),
+        ({"discount": 1.5}, "discount=1.5 must be within 0 and 1"),
+        ({"importance_exponent": -1.0}, "must not be negative"),
+    ],
+)
+def test_settings_that_learn_nothing_are_refused(fields, match):
+    with pytest.raises(ValueError, match=match):
+        LearnerConfig(**fields)
+
+
+class Draw(NamedTuple):
+    """A stand-in for what the replay's client returns."""
+
+    ids: np.ndarray
+    probabilities: np.ndarray
+    rows: np.ndarray
+
+
+ROW = np.dtype([("action", "<i4"), ("reward", "<f4"), ("discount", "<f4")])
+
+
+def test_the_loop_publishes_and_returns_priorities():
+    rng = np.random.default_rng(0)
+    published, updated = [], []
+    draws = []
+    for index in range(6):
+        rows = np.zeros(8, ROW)
+        rows["action"] = rng.integers(0, ACTIONS, 8)
+        rows["reward"] = 0.1 * index
+        ids = np.arange(8, dtype=np.uint64) + 8 * index
+        draws.append(Draw(ids, np.full(8, 0.1), rows))
+    source = iter([draws[0], None, *draws[1:]])
+    learner = make_learner(publish_period=2)
+    steps = learn(
+        learner=learner,
+        sample=lambda: next(source),
+        update_priorities=lambda ids, values: updated.append((ids, values)),
+        render=lambda rows: (
+            make_observations(len(rows), rng),
+            make_observations(len(rows), rng),
+        ),
+        publish=lambda version, vector: published.append((version, vector)),
+    )
+    turns = list(itertools.islice(steps, 7))
+    assert turns[1] is None
+    results = [turn.result for turn in turns if turn is not None]
+    assert len(results) == 6
+    assert all(isinstance(result, UpdateResult) for result in results)
+    # The caller has not asked for more, so the version of update 6 is out already.
+    assert [version for version, _ in published] == [0, 2, 4, 6]
+    np.testing.assert_array_equal(published[-1][1], learner.vector())
+    assert (published[0][1] != published[1][1]).any()
+    for (ids, values), draw, result in zip(updated, draws, results, strict=True):
+        np.testing.assert_array_equal(ids, draw.ids)
+        np.testing.assert_array_equal(values, result.priorities)
+    assert all(turn.updated_s > 0 for turn in turns if turn is not None)
