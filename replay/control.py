@@ -39,7 +39,7 @@ class StatsReply(Message, frozen=True, kw_only=True, tag=True):
     """The service's counters since it started."""
 
     incarnation: Count  # of the service's process
-    schema_hash: bytes
+    schema_hash: str  # hexadecimal
     capacity: Count  # rows
     size: Count  # rows in the table now
     inserts: Count  # rows

@@ -16,6 +16,7 @@ Settings that were measured to matter:
 
 import ipaddress
 import json
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -142,3 +143,27 @@ def _listen_message(listen: Sequence[str], reason: str) -> str:
     if "in use" in reason:
         return f"{endpoint}: port in use; stop what uses it or choose another port"
     return f"cannot listen on {endpoint}: is it an address of this machine?"
+
+
+def ask(
+    session: zenoh.Session, key: str, payload: bytes = b"", *, timeout_s: float
+) -> bytes | None:
+    """One query, one answer; None if nobody answers (also when access is denied)."""
+    answers: list[bytes] = []
+    ended = threading.Event()
+
+    def on_reply(reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            answers.append(reply.ok.payload.to_bytes())
+
+    session.get(
+        key,
+        zenoh.handlers.Callback(on_reply, ended.set),
+        payload=payload,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        timeout=timeout_s,
+    )
+    # Zenoh ends the query at its timeout; the margin covers a loaded machine.
+    ended.wait(timeout_s + 5.0)
+    return answers[0] if answers else None
