@@ -7,7 +7,8 @@ before the environment resets itself:
     a_tm1 `action`, the index that led there, and `q_values` that it was chosen by
     r_t   `reward`; `overlap`, `offroad` and `progress` are those of s_t
 
-`progress` is the distance along the log's route over the route's length (1: arrived).
+`progress` is the distance along the log's route over the route's length (1: arrived;
+NaN: the log has no route to speak of).
 One message carries consecutive steps of one environment; an auto-reset may lie
 between two of them, and shows as another scene or a step that does not follow.
 
@@ -104,8 +105,9 @@ def _check(batch: FrameBatch) -> None:
         raise FrameError("frames: action index below -1")
     if actions and int(frames["action"].max()) >= actions:
         raise FrameError(f"frames: action index outside the {actions} Q-values")
-    floats = [frames[name] for name in ("state", "reward", "progress")]
-    if not all(np.isfinite(values).all() for values in [*floats, batch.q_values]):
+    floats = [frames["state"], frames["reward"], batch.q_values]
+    finite = all(np.isfinite(values).all() for values in floats)
+    if not finite or np.isinf(frames["progress"]).any():
         raise FrameError("frames: a value is not finite")
 
 

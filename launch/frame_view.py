@@ -6,7 +6,7 @@
     ROOT/ego                the controlled object; red while it overlaps or is off-road
     ROOT/recorded           outline of where the log has the controlled object
     ROOT/trail, ROOT/route  where it has been; the log's route ahead of it
-    ROOT/plots/...          scalars: speed, reward, return, progress, failures, action
+    ROOT/plots/...          scalars: speed, reward, progress, failures, action
     ROOT/q_values           the Q-values of all actions
     ROOT/q_bars/{all,chosen}   the same above their lowest, the chosen action in colour
     ROOT/about              scenario, step, policy and action in words
@@ -240,29 +240,34 @@ class EnvironmentView:
         logged = np.where(
             scene.valid[controlled, steps], scene.speed[controlled, steps], np.nan
         )
-        series = {
-            "speed/driven": np.linalg.norm(frames["state"][:, 3:], axis=1),
-            "speed/recorded": logged,
-            "reward/reward": frames["reward"],
-            "reward/return": returns,
-            "progress/progress": frames["progress"],
-            "failures/overlap": frames["overlap"],
-            "failures/offroad": frames["offroad"],
-        }
+        driven = np.linalg.norm(frames["state"][:, 3:], axis=1)
+        action = frames["action"][:, None].astype(np.float64)
         if self._actions is not None:
-            chosen = self._actions.values[np.maximum(frames["action"], 0)].T
-            series |= {f"action/{row}": values for row, values in enumerate(chosen)}
-        else:
-            series["action/index"] = frames["action"]
+            action = self._actions.values[np.maximum(frames["action"], 0)]
+        series = {
+            # To cm/s: a plot scales itself to the noise of a standing car otherwise.
+            "speed": np.round(np.stack([driven, logged], axis=-1), 2),
+            "reward": np.stack([frames["reward"], returns], axis=-1),
+            "progress": frames["progress"][:, None],
+            "failures": np.stack([frames["overlap"], frames["offroad"]], axis=-1),
+            "action": action,
+        }
         for name, values in series.items():
-            numbers, at = np.asarray(values, np.float64), piece.at
-            if piece.begins:  # a gap, or the line would join two episodes
-                numbers = np.concatenate([[np.nan], numbers])
-                at = np.concatenate([at[:1], at])
-            columns = rr.Scalars.columns(scalars=numbers)
-            send(self._recording, f"{self._root}/plots/{name}", at, columns)
+            self._send_scalars(name, values.astype(np.float64), piece)
         if piece.q_values.shape[1]:
             self._log_q_values(piece)
+
+    def _send_scalars(
+        self, name: str, values: Float[np.ndarray, "frames lines"], piece: Piece
+    ) -> None:
+        """One plot's lines: as many values a frame."""
+        at, lines = piece.at, values.shape[1]
+        if piece.begins:  # a gap, or the lines would join two episodes
+            values = np.concatenate([np.full((1, lines), np.nan), values])
+            at = np.concatenate([at[:1], at])
+        columns = rr.Scalars.columns(scalars=values.ravel())
+        entity = f"{self._root}/plots/{name}"
+        send(self._recording, entity, at, columns.partition([lines] * len(at)))
 
     def _log_q_values(self, piece: Piece) -> None:
         """Q-values as they are, and as bars.
@@ -292,24 +297,30 @@ class EnvironmentView:
     def _log_styles(self) -> None:
         """Names and colours of the plots' lines."""
         plots = f"{self._root}/plots"
-        styles: tuple[tuple[str, str, Colour], ...] = (
-            ("speed/driven", "driven [m/s]", EGO),
-            ("speed/recorded", "recorded [m/s]", (150, 156, 166, 255)),
-            ("reward/reward", "reward", (255, 190, 40, 255)),
-            ("reward/return", "return", (52, 211, 103, 255)),
-            ("progress/progress", "progress", ROUTE),
-            ("failures/overlap", "overlap", FAILED),
-            ("failures/offroad", "off-road", (255, 140, 60, 255)),
-        )
-        for name, label, colour in styles:
-            line = rr.SeriesLines(colors=[colour], names=[label], widths=[2.0])
-            self._recording.log(f"{plots}/{name}", line, static=True)
-        for row, label in enumerate(self._actions.names if self._actions else ()):
-            line = rr.SeriesLines(names=[label], widths=[2.0])
-            self._recording.log(f"{plots}/action/{row}", line, static=True)
+        styles: dict[str, tuple[tuple[str, Colour], ...]] = {
+            "speed": (("driven [m/s]", EGO), ("recorded [m/s]", (150, 156, 166, 255))),
+            "reward": (("reward", (255, 190, 40, 255)), ("return", ROUTE)),
+            "progress": (("progress", ROUTE),),
+            "failures": (("overlap", FAILED), ("off-road", (255, 140, 60, 255))),
+        }
+        names = self._actions.names if self._actions is not None else ("index",)
+        colours: tuple[Colour, ...] = (EGO, (255, 190, 40, 255), CYCLIST)
+        styles["action"] = tuple(zip(names, colours, strict=False))
+        for name, lines in styles.items():
+            style = rr.SeriesLines(
+                names=[label for label, _ in lines],
+                colors=[colour for _, colour in lines],
+                widths=[2.0] * len(lines),
+            )
+            self._recording.log(f"{plots}/{name}", style, static=True)
         bars = f"{self._root}/q_bars"
         for name, colour in (("all", (104, 114, 128, 255)), ("chosen", EGO)):
             self._recording.log(f"{bars}/{name}", bar_colour(colour), static=True)
+
+
+def _percent(share: float) -> str:
+    """A share as a percentage; NaN is none."""
+    return "-" if np.isnan(share) else f"{100 * share:.0f} %"
 
 
 def _boxes(scene: ViewScene, step: int, chosen: Bool[np.ndarray, " objects"]) -> Boxes:
@@ -382,7 +393,7 @@ def _describe(
         *meaning,
         ("Q-value", f"{q_values[action]:.3f}" if known else "-"),
         ("reward", f"{frame['reward']:+.3f}"),
-        ("progress", f"{100 * frame['progress']:.0f} %"),
+        ("progress", _percent(float(frame["progress"]))),
         ("failures", f"**{' and '.join(failures)}**" if failures else "none"),
     )
     table = "\n".join(f"| {name} | {value} |" for name, value in rows)

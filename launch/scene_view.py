@@ -80,7 +80,7 @@ def send(
     recording: rr.RecordingStream,
     entity: str,
     at: Sequence[int] | Int[np.ndarray, " rows"],
-    columns: Iterable[object],
+    columns: Iterable[rr.ComponentColumn],
 ) -> None:
     """Sends columns at rows of the timeline `step`."""
     index = rr.TimeColumn("step", sequence=np.asarray(at))
