@@ -12,7 +12,8 @@ outline all around; objects' centres are half their height above the ground.
 The recording vehicle is valid throughout, moves at the start and drives on a road
 that goes on for at least 160 m after step 10. It is preferred to be one that would
 fail by driving on with its heading and speed of step 10, in `_HARD_SHARE` of the
-scenes: else most scenes would teach nothing but to coast.
+scenes (else many scenes would teach nothing but to coast), and in `_TURN_SHARE` one
+that turns where somebody does.
 """
 
 from collections.abc import Iterator
@@ -38,7 +39,8 @@ _MARGIN = 0.4  # m that logged boxes stay apart at least
 _EDGE_MARGIN = 0.1  # m that logged boxes stay inside the road edges at least
 _AHEAD = 160.0  # m of road that the recording vehicle has after `CURRENT_STEP`
 _LEAST, _MOST = 8, 24  # objects
-_HARD_SHARE = 0.75
+_HARD_SHARE = 0.65
+_TURN_SHARE = 0.5
 _FAMILIES = (curved_road, crossing, merge)
 _FAMILY_SHARES = (0.35, 0.4, 0.25)
 
@@ -198,7 +200,11 @@ def _recorder(
     fit &= (driven >= enough) & (objects.room > _AHEAD)
     hard = rng.random() < _HARD_SHARE
     candidates = rng.permutation(np.nonzero(fit)[0])
-    for row in candidates[:6]:
+    if rng.random() < _TURN_SHARE:
+        # Whoever turns comes first: on a crossing most go straight on.
+        turned = objects.pose[candidates, -1, 2] - objects.pose[candidates, 0, 2]
+        candidates = candidates[np.argsort(np.abs(turned) < 0.6, kind="stable")]
+    for row in candidates[:8]:
         fails = any(_coast(objects, edges, int(row)))
         if fails == hard:
             return int(row)

@@ -105,25 +105,21 @@ def stations_of(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
 def decimate(
     points: Float[np.ndarray, "n 2"], bend: float = 0.02, longest: float = 10.0
 ) -> Float[np.ndarray, "m 2"]:
-    """Drops points while less than `bend` radians and `longest` metres go by.
+    """Drops points so that a chord bends by `bend` radians or is `longest` metres.
 
-    The chord is then at most `bend` * gap / 8 from the curve: millimetres.
+    The chord is then at most `bend` * length / 8 from the curve: millimetres.
     """
-    gaps = np.hypot(*np.diff(points, axis=0).T)
-    points = points[np.concatenate([[True], gaps > 1e-6])]
     delta = np.diff(points, axis=0)
-    length = np.hypot(*delta.T).tolist()
+    length = np.hypot(delta[:, 0], delta[:, 1])
+    real = length > 1e-6
+    points = points[np.concatenate([[True], real])]
+    delta, length = delta[real], length[real]
     yaw = np.arctan2(delta[:, 1], delta[:, 0])
-    turns = np.abs((np.diff(yaw) + np.pi) % (2 * np.pi) - np.pi).tolist()
-    kept, walked, turned = [0], 0.0, 0.0
-    for index, turn in enumerate(turns, start=1):
-        walked += length[index - 1]
-        turned += turn
-        if turned > bend or walked + length[index] > longest:
-            kept.append(index)
-            walked, turned = 0.0, 0.0
-    kept.append(len(points) - 1)
-    return points[kept]
+    turned = np.abs((np.diff(yaw) + np.pi) % (2 * np.pi) - np.pi)
+    # A point is kept where the budget of bend and length overflows.
+    spent = np.floor(np.cumsum(turned / bend + length[1:] / longest))
+    kept = np.diff(spent, prepend=0.0) > 0
+    return points[np.concatenate([[True], kept, [True]])]
 
 
 def _unit_turn(angle: float) -> Float[np.ndarray, "n 2"]:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from sim.procedural_geometry import STEP, decimate, headings, resample
 from sim.scene import ObjectType, Polyline, RoadKind
 
-LATERAL_ACCELERATION = 2.0  # m/s^2 that the speed profile allows in a bend
+LATERAL_ACCELERATION = 1.7  # m/s^2 that the speed profile allows in a bend
 COMFORTABLE_BRAKING = 1.4  # m/s^2 with which the profile falls towards a bend
 
 

@@ -70,7 +70,7 @@ class _Highway:
 
 def merge(rng: np.random.Generator, steps: int) -> Layout:
     """Draws a layout of this family."""
-    tightest, widest = (220.0, 600.0) if rng.random() < 0.5 else (900.0, 5000.0)
+    tightest, widest = (220.0, 600.0) if rng.random() < 0.35 else (1500.0, 20000.0)
     join = rng.uniform(170.0, 240.0)
     highway = _Highway(
         road=winding(rng, _LENGTH, tightest, widest),

@@ -68,7 +68,7 @@ def winding(
 
 def curved_road(rng: np.random.Generator, steps: int) -> Layout:
     """Draws a layout of this family."""
-    tightest, widest = (32.0, 160.0) if rng.random() < 0.55 else (250.0, 2500.0)
+    tightest, widest = (32.0, 160.0) if rng.random() < 0.5 else (400.0, 8000.0)
     road = winding(rng, 430.0, tightest, widest)
     oncoming = int(rng.integers(0, 4)) if rng.random() < 0.8 else 0
     profile = Profile(

@@ -86,11 +86,13 @@ def tabulate(paths: tuple[DrivingPath, ...]) -> PathTables:
     near = np.zeros((count, count, longest, 4))
     apart = np.zeros((count, count, longest))
     flat_x, flat_y, flat_yaw = x.ravel(), y.ravel(), yaw.ravel()
+    # |p - q|^2 less |q|^2 as one product; float32 picks a neighbour at worst.
+    lean = np.stack([flat_x, flat_y, np.ones_like(flat_x)], -1).astype(np.float32)
     for p, path in enumerate(paths):
         real = len(path.yaw[:: stride[p]])
         px, py, pyaw = x[p, :real], y[p, :real], yaw[p, :real]
-        square = px**2 + py**2 - 2 * (flat_x[:, None] * px + flat_y[:, None] * py)
-        k = square.argmin(axis=1)
+        samples = np.stack([-2 * px, -2 * py, px**2 + py**2]).astype(np.float32)
+        k = (lean @ samples).argmin(axis=1)
         rx, ry = flat_x - px[k], flat_y - py[k]
         cos, sin = np.cos(pyaw[k]), np.sin(pyaw[k])
         along, left = rx * cos + ry * sin, ry * cos - rx * sin
