@@ -143,7 +143,10 @@ def _get(features: _Features, name: str, source: str) -> np.ndarray:
             f"{source}: the tf.Example has no numbers under {name!r}; only WOMD's "
             "motion examples are supported"
         )
-    return values
+    if values.dtype.kind == "i":
+        return values
+    with np.errstate(invalid="ignore"):  # signalling NaNs are refused further on
+        return values.astype(np.float64)
 
 
 def _text(features: _Features, name: str, source: str) -> str:
