@@ -101,6 +101,22 @@ def bicycle_inverse(
     return jnp.stack([acceleration, curvature])
 
 
+def bicycle_replay(
+    state: ObjectState, logged: ObjectState, following: ObjectState, dt: float
+) -> ObjectState:
+    """The log's Bicycle action from `logged` to `following`, applied to `state`.
+
+    Below `SLOW`, where the action holds no curvature, the recorded yaw is used.
+    """
+    moved = bicycle(state, bicycle_inverse(logged, following, dt), dt)
+    slow = (jnp.hypot(logged.v_x, logged.v_y) < SLOW) | (
+        jnp.hypot(following.v_x, following.v_y) < SLOW
+    )
+    speed = jnp.hypot(moved.v_x, moved.v_y)
+    yaw = jnp.where(slow, following.yaw, moved.yaw)
+    return moved._replace(yaw=yaw, v_x=speed * jnp.cos(yaw), v_y=speed * jnp.sin(yaw))
+
+
 def limit_reverse(
     state: ObjectState, action: Float[Array, "2"], dt: float
 ) -> Float[Array, "2"]:

@@ -27,7 +27,8 @@ FINE = 4
 EDGE_CELL = CELL / FINE
 MARGIN = 15.0  # m around the map's and the logs' bounding box
 BELOW, ABOVE = 0.5, 3.0  # m; a box's centre is 0.5 to 2 m above the road
-NEARBY = 15.0  # m: road points this near to a cell set its range of heights
+NEARBY = 3  # cells: road points this near to a cell set its range of heights
+LEVELS = (32, 8, 1)  # sides of the squares that `edge_table` decides, in fine cells
 ROW_TOLERANCE = 0.15  # m
 HEIGHT_WEIGHT = 2.0  # the issue's and Waymax's: a bridge is not the road below
 
@@ -144,73 +145,128 @@ def edge_table(
     """Each fine cell's state (MIXED, ...) and, where it is MIXED, its candidates,
     nearest to its centre first.
 
-    Fine cell (i, j) of `grid.fine` covers `EDGE_CELL` metres a side. Cells narrow the
-    edges down first, so that fine cells look at a few dozen each.
+    Fine cell (i, j) of `grid.fine` covers `EDGE_CELL` metres a side. Squares of `LEVELS`
+    narrow the edges down from large to small; one that all its edges agree on is done.
     """
     fine = grid.fine
-    state = np.full(fine.cells, DRIVABLE, np.int8)
+    state = np.full(fine.shape, DRIVABLE, np.int8)
     candidates = [np.zeros(0, np.int64)] * fine.cells
     if not len(edges.start):
-        return state, candidates
-    centres = grid.centres()
-    heights = _height_ranges(centres, ground)
-    inside = (np.arange(FINE) + 0.5) * EDGE_CELL - CELL / 2
-    offsets = np.stack(np.meshgrid(inside, inside, indexing="ij"), -1).reshape(-1, 2)
-    for first in range(0, grid.cells, 256):
-        chunk = slice(first, min(first + 256, grid.cells))
-        near, _ = _possible(centres[chunk], heights[chunk], edges, CELL)
-        for cell in range(chunk.start, chunk.stop):
-            index = np.flatnonzero(near[cell - first])
-            subset = edges.take(index)
-            parts = centres[cell] + offsets
-            bounds = np.broadcast_to(heights[cell], (len(parts), 2))
-            possible, squared = _possible(parts, bounds, subset, EDGE_CELL)
-            left, right = _sides(parts, subset, EDGE_CELL)
-            all_left = (left | ~possible).all(1)
-            all_right = (right | ~possible).all(1)
-            i, j = divmod(cell, grid.shape[1])
-            di, dj = np.divmod(np.arange(FINE * FINE), FINE)
-            numbers = (i * FINE + di) * fine.shape[1] + j * FINE + dj
-            state[numbers] = np.where(
-                all_left, DRIVABLE, np.where(all_right, UNDRIVABLE, MIXED)
-            )
-            for part in np.flatnonzero(~(all_left | all_right)):
-                chosen = np.flatnonzero(possible[part])
-                chosen = chosen[squared[part, chosen].argsort(kind="stable")]
-                candidates[numbers[part]] = index[chosen]
-    return state, candidates
+        return state.ravel(), candidates
+    heights = _height_ranges(grid, ground)
+    every = np.arange(len(edges.start))
+    pending = [(np.zeros(2, int), every, max(fine.shape))]
+    while pending:
+        corner, index, width = pending.pop()
+        size = next(level for level in LEVELS if level < width)
+        corners = _children(corner, width, size, fine.shape)
+        centres = grid.origin + (corners + size / 2) * EDGE_CELL
+        bounds = _bounds(heights, corners, size)
+        subset = edges.take(index)
+        possible, squared = _possible(centres, bounds, subset, size * EDGE_CELL)
+        agreed = _agreed(centres, possible, subset, size * EDGE_CELL)
+        _paint(state, corners, size, agreed)
+        for row in np.flatnonzero(agreed == MIXED):
+            i, j = corners[row]
+            near = np.flatnonzero(possible[row])
+            if size > 1:
+                pending.append((corners[row], index[near], size))
+            else:
+                near = near[squared[row, near].argsort(kind="stable")]
+                candidates[i * fine.shape[1] + j] = index[near]
+    return state.ravel(), candidates
+
+
+def _paint(
+    state: Int[np.ndarray, "across along"],
+    corners: Int[np.ndarray, "squares 2"],
+    size: int,
+    values: Int[np.ndarray, " squares"],
+) -> None:
+    """Gives every fine cell of each square its value, as far as the grid reaches."""
+    if size == 1:
+        state[corners[:, 0], corners[:, 1]] = values
+        return
+    for (i, j), value in zip(corners, values, strict=True):
+        state[i : i + size, j : j + size] = value
+
+
+def _children(
+    corner: Int[np.ndarray, "2"], width: int, size: int, shape: tuple[int, int]
+) -> Int[np.ndarray, "children 2"]:
+    """First fine cells of the squares of `size` within a square of `width`."""
+    steps = np.arange(0, width, size)
+    corners = corner + np.stack(np.meshgrid(steps, steps, indexing="ij"), -1)
+    corners = corners.reshape(-1, 2)
+    return corners[(corners < shape).all(1)]
+
+
+def _bounds(
+    heights: Float[np.ndarray, "2 across along"],
+    corners: Int[np.ndarray, "squares 2"],
+    size: int,
+) -> Float[np.ndarray, "squares 2"]:
+    """The range of heights over each square [m], from those of the cells in it."""
+    first = corners // FINE
+    reach = np.arange(max(size // FINE, 1))
+    i = np.minimum(first[:, 0, None] + reach, heights.shape[1] - 1)
+    j = np.minimum(first[:, 1, None] + reach, heights.shape[2] - 1)
+    low = heights[0][i[:, :, None], j[:, None]].min((1, 2))
+    high = heights[1][i[:, :, None], j[:, None]].max((1, 2))
+    return np.stack([low, high], -1)
+
+
+def _agreed(
+    centres: Float[np.ndarray, "cells 2"],
+    possible: Bool[np.ndarray, "cells edges"],
+    edges: Edges,
+    size: float,
+) -> Int[np.ndarray, " cells"]:
+    """DRIVABLE or UNDRIVABLE where all possible edges say so of the whole cell."""
+    left, right = _sides(centres, edges, size)
+    all_left = (left | ~possible).all(1)
+    all_right = (right | ~possible).all(1)
+    return np.where(
+        all_left, DRIVABLE, np.where(all_right, UNDRIVABLE, MIXED)
+    ).astype(np.int8)
 
 
 def _height_ranges(
-    centres: Float[np.ndarray, "cells 2"], ground: Float[np.ndarray, "points 3"]
-) -> Float[np.ndarray, "cells 2"]:
+    grid: Grid, ground: Float[np.ndarray, "points 3"]
+) -> Float[np.ndarray, "2 across along"]:
     """Lowest and highest height of a box's centre to allow for in each cell [m].
 
-    Cells with no road point nearby take the whole scene's range.
+    From the road points within `NEARBY` cells; a cell with none takes the scene's.
     """
-    ranges = np.empty((len(centres), 2))
-    ranges[:] = ground[:, 2].min(), ground[:, 2].max()
-    buckets = np.floor((ground[:, :2] - centres[0]) / NEARBY).astype(int)
-    keys, inverse = np.unique(buckets, axis=0, return_inverse=True)
-    lowest = np.full(len(keys), np.inf)
-    highest = np.full(len(keys), -np.inf)
-    np.minimum.at(lowest, inverse.ravel(), ground[:, 2])
-    np.maximum.at(highest, inverse.ravel(), ground[:, 2])
-    of_key = {(int(i), int(j)): k for k, (i, j) in enumerate(keys)}
-    own = np.floor((centres - centres[0]) / NEARBY).astype(int)
-    for bucket in np.unique(own, axis=0):
-        around = [
-            of_key[key]
-            for di in (-1, 0, 1)
-            for dj in (-1, 0, 1)
-            if (key := (int(bucket[0]) + di, int(bucket[1]) + dj)) in of_key
-        ]
-        if around:
-            ranges[(own == bucket).all(1)] = (
-                lowest[around].min(),
-                highest[around].max(),
-            )
-    return ranges + [-BELOW, ABOVE]
+    cells = np.floor((ground[:, :2] - grid.origin) / CELL).astype(int)
+    cells = np.clip(cells, 0, np.array(grid.shape) - 1)
+    low = np.full(grid.shape, np.inf)
+    high = np.full(grid.shape, -np.inf)
+    np.minimum.at(low, (cells[:, 0], cells[:, 1]), ground[:, 2])
+    np.maximum.at(high, (cells[:, 0], cells[:, 1]), ground[:, 2])
+    for axis in (0, 1):
+        low = _spread(low, axis, np.minimum, np.inf)
+        high = _spread(high, axis, np.maximum, -np.inf)
+    none = np.isinf(low)
+    low[none], high[none] = ground[:, 2].min(), ground[:, 2].max()
+    return np.stack([low - BELOW, high + ABOVE])
+
+
+def _spread(
+    values: Float[np.ndarray, "across along"],
+    axis: int,
+    combine: np.ufunc,
+    empty: float,
+) -> Float[np.ndarray, "across along"]:
+    """Each cell combined with the `NEARBY` cells on either side along an axis."""
+    pads = [(NEARBY, NEARBY) if k == axis else (0, 0) for k in (0, 1)]
+    padded = np.pad(values, pads, constant_values=empty)
+    length = values.shape[axis]
+    shifted = [
+        np.take(padded, np.arange(shift, shift + length), axis)
+        for shift in range(2 * NEARBY + 1)
+    ]
+    return np.asarray(combine.reduce(shifted))
 
 
 def _possible(

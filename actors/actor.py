@@ -1,0 +1,213 @@
+"""The acting loop: scan, hand the transitions over, take the latest weights, repeat.
+
+A generator, so that stopping, logging and status belong to the caller. Writing blocks
+while the window of unacknowledged batches is full: that is how the replay's rate
+limiter slows its actors down. Weights change between two scans only, and every
+transition carries the version that it was made with.
+"""
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from actors import acting
+from actors.acting import ActingConfig, Transitions
+from actors.frames import FrameBatch, make_frames
+from actors.rows import row_spec
+from sim.bank import Bank
+
+
+@dataclass(frozen=True)
+class ActorConfig:
+    """How an actor acts."""
+
+    environments: int = 32
+    """Environments stepped at once (M)."""
+    scan_steps: int = 8
+    """Steps per compiled call, and per batch of rows sent (K)."""
+    epsilon_lowest: float = 0.01
+    """Probability of a random action in the least exploring environment."""
+    epsilon_highest: float = 0.4
+    """And in the most exploring one; log-spaced between, over all actors."""
+    window: int = 4
+    """Batches that may be under way to the replay without an acknowledgement."""
+    watched: int = 1
+    """Environments whose frames a viewer can see."""
+
+    def __post_init__(self) -> None:
+        """Refuses what makes no environment or no exploration schedule."""
+        for name in ("environments", "scan_steps", "window"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
+        if not 0 <= self.watched <= self.environments:
+            raise ValueError(
+                f"watched={self.watched} must be 0 to {self.environments} environments"
+            )
+        if not 0 < self.epsilon_lowest <= self.epsilon_highest <= 1:
+            raise ValueError(
+                f"epsilon_lowest={self.epsilon_lowest} and epsilon_highest="
+                f"{self.epsilon_highest} must satisfy 0 < lowest <= highest <= 1"
+            )
+
+
+@runtime_checkable
+class Weights(Protocol):
+    """What the weights channel hands over."""
+
+    @property
+    def version(self) -> int:
+        """The number of updates behind them."""
+
+    @property
+    def vector(self) -> Float[np.ndarray, " parameters"]:
+        """The weights."""
+
+
+class Tick(NamedTuple):
+    """One scan, as the caller sees it."""
+
+    steps: int  # environment steps taken so far
+    version: int  # of the weights acted with
+    scores: Float[np.ndarray, " ended"]  # returns of the episodes that ended
+    failed: np.ndarray  # [ended] bool: an overlap or off-road within it
+    progress: Float[np.ndarray, " ended"]  # of the log's route; NaN: the log stood
+    acted_s: float  # in the scan
+    waited_s: float  # handing over the rows
+
+
+def run_actor(
+    *,
+    key: PRNGKeyArray,
+    bank: Bank,
+    config: ActorConfig,
+    acting_config: ActingConfig,
+    actor: int,
+    actors: int,
+    latest: Callable[[], Weights],
+    write: Callable[[np.ndarray], object],
+    show: Callable[[FrameBatch], object] | None = None,
+) -> Iterator[Tick]:
+    """Acts for ever.
+
+    Args:
+        key: of this actor and of this start of it.
+        bank: the scenes.
+        config: sizes and exploration.
+        acting_config: what is compiled.
+        actor: this actor's number, from 0.
+        actors: how many there are, for the exploration's spacing.
+        latest: the newest weights; called between scans.
+        write: takes a batch of rows; blocks while the replay holds back.
+        show: takes the watched environments' frames, where somebody watches.
+    """
+    start_key, key = jax.random.split(key)
+    act = jax.jit(
+        functools.partial(
+            acting.act, config=acting_config, watched=config.watched
+        )
+    )
+    epsilon = jnp.asarray(
+        acting.epsilons(
+            actor=actor,
+            actors=actors,
+            environments=config.environments,
+            lowest=config.epsilon_lowest,
+            highest=config.epsilon_highest,
+        )
+    )
+    running = acting.start(
+        start_key, bank, config.environments, acting_config.environment
+    )
+    version, vector = -1, jnp.zeros(0)
+    steps = 0
+    while True:
+        weights = latest()
+        if weights.version != version:
+            version, vector = weights.version, _on_device(weights.vector)
+        began = time.perf_counter()
+        key, scan_key = jax.random.split(key)
+        running, batch = act(scan_key, bank, vector, running, epsilon)
+        transitions: Transitions = jax.device_get(batch)
+        acted = time.perf_counter()
+        rows = rows_of(transitions, version=version, actor=actor, first=steps)
+        steps += len(rows)
+        write(rows)
+        if show is not None:
+            for environment in range(config.watched):
+                show(frames_of(transitions, environment, actor, steps, version))
+        ended = transitions.over
+        yield Tick(
+            steps=steps,
+            version=version,
+            scores=transitions.score[ended],
+            failed=transitions.failed[ended],
+            progress=transitions.progress[ended],
+            acted_s=acted - began,
+            waited_s=time.perf_counter() - acted,
+        )
+
+
+def _on_device(vector: Float[np.ndarray, " n"]) -> Float[Array, " n"]:
+    # A copy of its own: `device_put` may alias a receive buffer that is used again.
+    return jnp.array(np.array(vector, np.float32, copy=True))
+
+
+def rows_of(
+    transitions: Transitions, *, version: int, actor: int, first: int
+) -> np.ndarray:
+    """The transitions as rows, step by step; `first` is the first one's serial."""
+    steps, environments = transitions.scene.shape
+    rows = np.zeros(
+        steps * environments, row_spec(transitions.states.shape[2] - 1).dtype
+    )
+    for name in (
+        "scene",
+        "step",
+        "controlled",
+        "states",
+        "valid",
+        "action",
+        "reward",
+        "discount",
+    ):
+        values = np.asarray(getattr(transitions, name))
+        rows[name] = values.reshape(len(rows), *values.shape[2:])
+    rows["weights_version"] = version
+    rows["actor"] = actor
+    rows["serial"] = first + np.arange(len(rows))
+    return rows
+
+
+def frames_of(
+    transitions: Transitions, environment: int, actor: int, steps: int, version: int
+) -> FrameBatch:
+    """What a viewer needs of one watched environment."""
+    column = jax.tree.map(
+        lambda values: np.asarray(values)[:, environment], transitions
+    )
+    return FrameBatch(
+        actor=actor,
+        environment=environment,
+        actor_steps=steps,
+        weights_version=version,
+        frames=make_frames(
+            len(column.scene),
+            scene=column.scene,
+            step=column.step,
+            controlled=column.controlled,
+            state=column.states[:, -1],
+            action=column.action,
+            reward=column.reward,
+            progress=np.nan_to_num(column.progress),
+            overlap=column.overlap,
+            offroad=column.offroad,
+        ),
+        q_values=column.q_values,
+    )

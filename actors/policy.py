@@ -1,0 +1,149 @@
+"""The trained policy: read from a checkpoint without torch, acting greedily."""
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from actors.network import (
+    NetworkConfig,
+    batched,
+    layout_hash,
+    parameter_count,
+    parameter_layout,
+)
+from sim.agents import Agent, Decision, discrete
+from sim.bank import Bank
+from sim.environment import EnvironmentConfig, State
+from sim.observation import (
+    Observation,
+    ObservationSizes,
+    observation_sizes,
+    observe_batch,
+)
+
+POLICY = "policy.npz"
+LATEST = "latest"
+
+
+class PolicyError(Exception):
+    """A policy cannot be read or used; the message says what, where, what to do."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Weights with what they are the weights of."""
+
+    vector: Float[np.ndarray, " parameters"]
+    network: NetworkConfig
+    sizes: ObservationSizes
+    actions: int
+    extra: dict[str, Any]  # what the run put beside it, its configuration
+
+    def check(self, environment: EnvironmentConfig, where: Path) -> None:
+        """Refuses an environment that this policy does not fit."""
+        sizes = observation_sizes(environment.observation)
+        if (self.sizes, self.actions) != (sizes, environment.action.count):
+            raise PolicyError(
+                f"checkpoint {where} is of another network: it reads "
+                f"{self.sizes} and has {self.actions} actions, the environment gives "
+                f"{sizes} and {environment.action.count}; use the run's own config.json"
+            )
+
+
+def find_policy(path: Path) -> Path:
+    """The `policy.npz` that a user means by a run, its checkpoints, or one of them."""
+    for folder in (path, path / "checkpoints"):
+        pointer = folder / LATEST
+        if pointer.is_file():
+            path = folder / pointer.read_text().strip()
+            break
+    file = path if path.name == POLICY else path / POLICY
+    if not file.is_file():
+        raise PolicyError(
+            f"{path}: no checkpoint there (looked for {POLICY}); name a run folder, a "
+            "checkpoint in it, or one of the built-in agents"
+        )
+    return file
+
+
+def read_policy(path: Path) -> Policy:
+    """Reads a policy, whichever of its folders is named."""
+    file = find_policy(path)
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            policy = Policy(
+                vector=arrays["vector"],
+                network=NetworkConfig(**json.loads(str(arrays["network"]))),
+                sizes=ObservationSizes(**json.loads(str(arrays["sizes"]))),
+                actions=int(arrays["actions"]),
+                extra=json.loads(str(arrays["extra"])),
+            )
+            named = str(arrays["layout_hash"])
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise PolicyError(
+            f"{file}: cannot be read as a policy ({error}); it is damaged or of another "
+            "version: use another checkpoint"
+        ) from error
+    layout = parameter_layout(policy.network, policy.sizes, policy.actions)
+    if layout_hash(layout) != named or policy.vector.shape != (
+        parameter_count(layout),
+    ):
+        raise PolicyError(
+            f"{file}: its weights are laid out for another network ({named}, this "
+            f"program lays it out as {layout_hash(layout)}); use another checkpoint"
+        )
+    return policy
+
+
+def greedy(
+    vector: Float[Array, " parameters"],
+    network: NetworkConfig,
+    config: EnvironmentConfig,
+) -> Agent:
+    """Takes the action of the highest Q-value for every controlled object."""
+    sizes = observation_sizes(config.observation)
+    actions = config.action.count
+
+    def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
+        objects = state.controlled.shape[0]
+        observation: Observation = observe_batch(
+            bank,
+            jnp.broadcast_to(state.scene, (objects,)),
+            jnp.broadcast_to(state.step, (objects,)),
+            state.controlled,
+            state.history,
+            state.history_valid,
+            config.observation,
+        )
+        q_values = batched(
+            vector, observation, config=network, sizes=sizes, actions=actions
+        )
+        action = jnp.argmax(q_values, -1).astype(jnp.int32)
+        return discrete(state, action, q_values, config)
+
+    return act
+
+
+def random_vector(
+    key: PRNGKeyArray, network: NetworkConfig, config: EnvironmentConfig
+) -> Float[Array, " parameters"]:
+    """Weights of an untrained network: norms at 1, the rest normal by fan-in."""
+    sizes = observation_sizes(config.observation)
+    parts = []
+    layout = parameter_layout(network, sizes, config.action.count)
+    for name, shape in layout:
+        key, own_key = jax.random.split(key)
+        if len(shape) > 1:
+            scale = shape[-1] ** -0.5
+            parts.append((jax.random.normal(own_key, shape) * scale).ravel())
+        else:
+            norm = name.endswith("norm.weight")
+            parts.append(jnp.full(shape, 1.0 if norm else 0.0))
+    return jnp.concatenate(parts)

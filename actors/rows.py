@@ -1,0 +1,81 @@
+"""Transition rows: states travel, observations are rendered where they are consumed.
+
+One row is one transition of the controlled object in log-replayed traffic: the scene,
+the step t of s_t, the object's last H+1 states (oldest first: the first H belong to
+s_tm1, the last H to s_t), what it did and got. Everything else that it saw is a
+function of the scene and the step, which every process of the run can look up.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from replay.spec import Field, RowSpec
+from sim.bank import Bank
+from sim.observation import Observation, ObservationConfig, observe_batch
+
+
+def row_spec(history: int) -> RowSpec:
+    """The layout of a row for `history` states per observation."""
+    return RowSpec(
+        (
+            Field("scene", "i4"),
+            Field("step", "i4"),  # t of s_t
+            Field("controlled", "i4"),  # row of the log's objects
+            Field("states", "f4", (history + 1, 5)),  # x, y, yaw, v_x, v_y
+            Field("valid", "u1", (history + 1,)),
+            Field("action", "i4"),  # a_tm1, index into the action table
+            Field("reward", "f4"),  # r_t
+            Field("discount", "f4"),  # 1, or 0 if and only if s_t is terminal
+            Field("weights_version", "i8"),  # of the policy that acted
+            Field("actor", "i4"),
+            Field("serial", "i8"),  # the actor's own count of its transitions
+        )
+    )
+
+
+class Columns(NamedTuple):
+    """The part of a batch of rows that observations are rendered from."""
+
+    scene: Int[Array, " batch"]
+    step: Int[Array, " batch"]
+    controlled: Int[Array, " batch"]
+    states: Float[Array, "batch states 5"]
+    valid: Bool[Array, "batch states"]
+
+
+def columns_of(rows: np.ndarray) -> Columns:
+    """The columns of a batch of rows, as contiguous arrays."""
+    return Columns(
+        scene=np.ascontiguousarray(rows["scene"]),
+        step=np.ascontiguousarray(rows["step"]),
+        controlled=np.ascontiguousarray(rows["controlled"]),
+        states=np.ascontiguousarray(rows["states"]),
+        valid=rows["valid"].astype(bool),
+    )
+
+
+def render(
+    bank: Bank, columns: Columns, config: ObservationConfig
+) -> tuple[Observation, Observation]:
+    """The observations s_tm1 and s_t of a batch of rows, in one call of twice the batch.
+
+    Bit for bit those that the actor acted on: `observe_batch` is the same program
+    whatever surrounds it (tested).
+    """
+    both = observe_batch(
+        bank,
+        jnp.concatenate([columns.scene, columns.scene]),
+        jnp.concatenate([columns.step - 1, columns.step]),
+        jnp.concatenate([columns.controlled, columns.controlled]),
+        jnp.concatenate([columns.states[:, :-1], columns.states[:, 1:]]),
+        jnp.concatenate([columns.valid[:, :-1], columns.valid[:, 1:]]),
+        config,
+    )
+    batch = columns.scene.shape[0]
+    first = jax.tree.map(lambda values: values[:batch], both)
+    second = jax.tree.map(lambda values: values[batch:], both)
+    return first, second

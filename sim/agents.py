@@ -1,0 +1,133 @@
+"""Agents that need no learning: playback, expert, constant speed, random.
+
+An agent says where the controlled objects of one scene are at the next step. The
+experts are the paper's (appendix A.1): the log's action by the inverse dynamics,
+applied to the simulated state, so that the action space's limits and errors show.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from sim import dynamics
+from sim.bank import Bank
+from sim.dynamics import ActionSpace, ObjectState
+from sim.environment import EnvironmentConfig, State, logged_states
+
+
+class Decision(NamedTuple):
+    """Where the controlled objects go, and what made them."""
+
+    moved: Float[Array, "controlled 5"]  # x, y, yaw, v_x, v_y at the next step
+    action: Int[Array, " controlled"]  # index into the action table, -1: none
+    q_values: Float[Array, "controlled actions"]  # no columns: none
+
+
+Agent = Callable[[PRNGKeyArray, Bank, State], Decision]
+
+
+def _continuous(moved: Float[Array, "controlled 5"]) -> Decision:
+    """A decision without an index."""
+    objects = moved.shape[0]
+    return Decision(
+        moved, jnp.full(objects, -1, jnp.int32), jnp.zeros((objects, 0), jnp.float32)
+    )
+
+
+def _next_logged(bank: Bank, state: State) -> Float[Array, "controlled 5"]:
+    step_t = jnp.minimum(state.step + 1, bank.log.shape[1] - 1)
+    return logged_states(bank, state.scene, step_t, state.controlled)
+
+
+def log_playback() -> Agent:
+    """Goes where the log went."""
+
+    def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
+        return _continuous(_next_logged(bank, state))
+
+    return act
+
+
+def constant_speed(config: EnvironmentConfig) -> Agent:
+    """Keeps speed and heading."""
+
+    def one(state: ObjectState) -> Float[Array, "5"]:
+        still = dynamics.bicycle(state, jnp.zeros(2), config.dt)
+        return jnp.stack(still)
+
+    def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
+        # Once straightened, the velocity lies along the yaw and stays there.
+        return _continuous(jax.vmap(one)(ObjectState(*state.history[:, -1].T)))
+
+    return act
+
+
+def random_actions(config: EnvironmentConfig) -> Agent:
+    """Draws every object's action uniformly from the grid."""
+
+    def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
+        shape = state.controlled.shape
+        action = jax.random.randint(key, shape, 0, config.action.count, jnp.int32)
+        return discrete(state, action, jnp.zeros((shape[0], 0), jnp.float32), config)
+
+    return act
+
+
+def discrete(
+    state: State,
+    action: Int[Array, " controlled"],
+    q_values: Float[Array, "controlled actions"],
+    config: EnvironmentConfig,
+) -> Decision:
+    """The decision that an index of the grid leads to."""
+    moved = jax.vmap(dynamics.apply_discrete, in_axes=(0, 0, None, None))(
+        ObjectState(*state.history[:, -1].T), action, config.action, config.dt
+    )
+    return Decision(jnp.stack(moved, -1), action, q_values)
+
+
+class ExpertSpace(NamedTuple):
+    """The action space that an expert acts through."""
+
+    space: ActionSpace
+    on_grid: bool  # rounded to the grid's nearest action
+
+
+def expert(config: EnvironmentConfig, through: ExpertSpace) -> Agent:
+    """Imitates the log through an action space."""
+    grid = dataclasses.replace(config.action, space=through.space)
+
+    def one(
+        now: ObjectState, logged: ObjectState, following: ObjectState
+    ) -> tuple[Float[Array, "5"], Int[Array, ""]]:
+        if through.space == ActionSpace.BICYCLE:
+            action = dynamics.bicycle_inverse(logged, following, config.dt)
+        else:
+            action = dynamics.delta_inverse(logged, following)
+        if through.on_grid:
+            index = dynamics.nearest_action(logged, action, grid)
+            moved = dynamics.apply_discrete(now, index, grid, config.dt)
+            return jnp.stack(moved), index
+        if through.space == ActionSpace.BICYCLE:
+            moved = dynamics.bicycle_replay(now, logged, following, config.dt)
+        else:
+            moved = dynamics.delta(now, action, config.dt)
+        return jnp.stack(moved), jnp.int32(-1)
+
+    def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
+        logged = logged_states(bank, state.scene, state.step, state.controlled)
+        following = _next_logged(bank, state)
+        moved, action = jax.vmap(one)(
+            ObjectState(*state.history[:, -1].T),
+            ObjectState(*logged.T),
+            ObjectState(*following.T),
+        )
+        return Decision(
+            moved, action, jnp.zeros((action.shape[0], 0), jnp.float32)
+        )
+
+    return act

@@ -1,0 +1,238 @@
+"""Reset, step and observe: one scene with some objects controlled, the rest replayed.
+
+Written for one scene; `jax.vmap` over scenes outside. A scene starts at the bank's
+`current_step` from the log's states; every later step moves the controlled objects by
+the action space's dynamics and all others to where they were recorded.
+
+Reward of the step from t-1 to t (Gulino et al., 2023, main text): minus overlap minus
+off-road at t. `progress` (off in the paper's preset) adds metres gained along the
+logged route, up to its end: the paper's reward alone is satisfied by standing still.
+
+Terminated is what ends the return (a failure, where `terminate` says so); truncated is
+the recording's end, after which there was more to come: only the first has discount 0.
+The paper does not say whether a failure ends an episode.
+
+Heights are not simulated: an object has its log's height of the same step. Where the
+controlled object was not recorded at t-1 and t it follows the log.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from sim import metrics
+from sim.bank import Bank
+from sim.dynamics import ActionConfig, ObjectState, apply_discrete
+from sim.observation import Observation, ObservationConfig, observe
+
+
+@dataclass(frozen=True)
+class EnvironmentConfig:
+    """What a controlled object does, sees and is rewarded for."""
+
+    action: ActionConfig = field(default_factory=ActionConfig)
+    """The grid of actions."""
+    observation: ObservationConfig = field(default_factory=ObservationConfig)
+    """What it sees."""
+    overlap_penalty: float = 1.0
+    """Subtracted from the reward at a step with an overlap."""
+    offroad_penalty: float = 1.0
+    """Subtracted from the reward at a step off the road."""
+    progress: float = 0.0
+    """Reward per metre gained along the logged route; 0 is the paper's."""
+    terminate: bool = False
+    """Whether a failure (overlap or off-road) ends the episode."""
+    dt: float = 0.1
+    """Length of a step [s]; a bank of another step length is refused."""
+
+
+class State(NamedTuple):
+    """One scene; batch with `jax.vmap`."""
+
+    scene: Int[Array, ""]  # row of the bank
+    step: Int[Array, ""]  # of the recording
+    controlled: Int[Array, " controlled"]  # rows of the log's objects
+    history: Float[Array, "controlled history 5"]  # x, y, yaw, v_x, v_y; oldest first
+    history_valid: Bool[Array, "controlled history"]
+    along: Float[Array, " controlled"]  # m, arc length on the logged route
+
+
+class Outcome(NamedTuple):
+    """What a step led to, for each controlled object."""
+
+    reward: Float[Array, " controlled"]
+    overlap: Bool[Array, " controlled"]
+    offroad: Bool[Array, " controlled"]
+    terminated: Bool[Array, " controlled"]
+    truncated: Bool[Array, ""]
+    valid: Bool[Array, " controlled"]  # recorded at this step: it counts
+
+
+def logged_states(
+    bank: Bank,
+    scene: Int[Array, ""],
+    step: Int[Array, ""],
+    controlled: Int[Array, " controlled"],
+) -> Float[Array, "controlled 5"]:
+    """States (x, y, yaw, v_x, v_y) of the log."""
+    row = bank.log[scene, step, controlled]
+    return jnp.stack([row[:, 0], row[:, 1], row[:, 3], row[:, 4], row[:, 5]], -1)
+
+
+def reset(
+    bank: Bank,
+    scene: Int[Array, ""],
+    controlled: Int[Array, " controlled"],
+    config: EnvironmentConfig,
+) -> State:
+    """The scene at its `current_step`, with the recorded history."""
+    return start_at(bank, scene, bank.current_step[scene], controlled, config)
+
+
+def start_at(
+    bank: Bank,
+    scene: Int[Array, ""],
+    step: Int[Array, ""],
+    controlled: Int[Array, " controlled"],
+    config: EnvironmentConfig,
+) -> State:
+    """The scene at any recorded step; history before step 0 is not valid."""
+    wanted = step - jnp.arange(config.observation.history - 1, -1, -1)
+    steps = jnp.maximum(wanted, 0)
+    history = jax.vmap(logged_states, in_axes=(None, None, 0, None), out_axes=1)(
+        bank, scene, steps, controlled
+    )
+    recorded = bank.log_valid[scene, steps[None], controlled[:, None]]
+    position = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
+        bank, scene, controlled, history[:, -1, 0], history[:, -1, 1]
+    )
+    return State(
+        scene=scene,
+        step=step,
+        controlled=controlled,
+        history=history,
+        history_valid=recorded & (wanted >= 0)[None],
+        along=position.along,
+    )
+
+
+def step(
+    bank: Bank,
+    state: State,
+    action: Int[Array, " controlled"],
+    config: EnvironmentConfig,
+) -> tuple[State, Outcome]:
+    """Applies one discrete action to each controlled object."""
+    moved = jax.vmap(apply_discrete, in_axes=(0, 0, None, None))(
+        ObjectState(*state.history[:, -1].T), action, config.action, config.dt
+    )
+    return advance(bank, state, jnp.stack(moved, -1), config)
+
+
+def advance(
+    bank: Bank,
+    state: State,
+    moved: Float[Array, "controlled 5"],
+    config: EnvironmentConfig,
+) -> tuple[State, Outcome]:
+    """Puts the controlled objects where their dynamics (any) say, and judges it."""
+    step_t = jnp.minimum(state.step + 1, bank.log.shape[1] - 1)
+    recorded = bank.log_valid[state.scene, :, state.controlled]
+    follows = recorded[:, state.step] & recorded[:, step_t]
+    now = jnp.where(
+        follows[:, None], moved, logged_states(bank, state.scene, step_t, state.controlled)
+    )
+    valid = recorded[:, step_t]
+    overlap, offroad = failures(bank, state.scene, step_t, state.controlled, now)
+    overlap, offroad = overlap & valid, offroad & valid
+    position = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
+        bank, state.scene, state.controlled, now[:, 0], now[:, 1]
+    )
+    end = bank.route_end[state.scene, state.controlled]
+    gained = jnp.minimum(position.along, end) - jnp.minimum(state.along, end)
+    reward = (
+        config.progress * gained
+        - config.overlap_penalty * overlap.astype(jnp.float32)
+        - config.offroad_penalty * offroad.astype(jnp.float32)
+    )
+    last = step_t >= bank.steps[state.scene] - 1
+    following = State(
+        scene=state.scene,
+        step=step_t,
+        controlled=state.controlled,
+        history=jnp.concatenate([state.history[:, 1:], now[:, None]], 1),
+        history_valid=jnp.concatenate([state.history_valid[:, 1:], valid[:, None]], 1),
+        along=position.along,
+    )
+    return following, Outcome(
+        reward=reward,
+        overlap=overlap,
+        offroad=offroad,
+        terminated=(overlap | offroad) & config.terminate,
+        truncated=last | ~valid.any(),
+        valid=valid,
+    )
+
+
+def failures(
+    bank: Bank,
+    scene: Int[Array, ""],
+    step_t: Int[Array, ""],
+    controlled: Int[Array, " controlled"],
+    now: Float[Array, "controlled 5"],
+) -> tuple[Bool[Array, " controlled"], Bool[Array, " controlled"]]:
+    """Overlap and off-road of the controlled objects, the others where the log is."""
+    row = bank.log[scene, step_t]
+    boxes = metrics.Box(
+        x=row[:, 0].at[controlled].set(now[:, 0]),
+        y=row[:, 1].at[controlled].set(now[:, 1]),
+        yaw=row[:, 3].at[controlled].set(now[:, 2]),
+        length=row[:, 6],
+        width=row[:, 7],
+    )
+    valid = bank.log_valid[scene, step_t]
+    overlap = jax.vmap(metrics.overlap, in_axes=(0, None, None))(
+        controlled, boxes, valid
+    )
+    own = metrics.Box(*(value[controlled] for value in boxes))
+    offroad = jax.vmap(metrics.offroad, in_axes=(None, None, 0, 0))(
+        bank, scene, own, row[controlled, 2]
+    )
+    return overlap, offroad
+
+
+def observe_state(
+    bank: Bank, state: State, index: int, config: EnvironmentConfig
+) -> Observation:
+    """What the controlled object of slot `index` sees."""
+    return observe(
+        bank,
+        state.scene,
+        state.step,
+        state.controlled[index],
+        state.history[index],
+        state.history_valid[index],
+        config.observation,
+    )
+
+
+def auto_reset(
+    key: PRNGKeyArray,
+    bank: Bank,
+    state: State,
+    outcome: Outcome,
+    config: EnvironmentConfig,
+) -> State:
+    """A random scene's start, with its SDC controlled, where the episode is over."""
+    over = outcome.truncated | outcome.terminated.all()
+    fresh = random_start(key, bank, config)
+    return jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, state)
+
+
+def random_start(key: PRNGKeyArray, bank: Bank, config: EnvironmentConfig) -> State:
+    """A random scene from its start, with its SDC controlled."""
+    scene = jax.random.randint(key, (), 0, bank.sdc.shape[0])
+    return reset(bank, scene, bank.sdc[scene][None], config)
