@@ -8,6 +8,8 @@ then decides exactly among it and its neighbours; `sim.metrics` has the definiti
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sim.procedural_geometry import nearest
+
 _PIECE = 2.0  # m, longest piece of road edge
 
 
@@ -86,17 +88,13 @@ class EdgeMap:
         step = (ends - starts)[index] / count[index, None]
         self._start = starts[index] + part[:, None] * step
         self._step = step
-        middle = self._start + 0.5 * step
-        self._middle = middle.astype(np.float32)
-        self._square = (middle**2).sum(-1).astype(np.float32)
+        self._middle = self._start + 0.5 * step
 
     def outside(self, points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
         """Whether a point lies right of its nearest edge."""
-        lean = points.astype(np.float32)
-        # |p - m|^2 less |p|^2: layouts are within 1 km, so float32 errs by 0.1 m^2.
-        nearest = (self._square - 2 * (lean @ self._middle.T)).argmin(axis=1)
+        middle = nearest(points, self._middle)
         last = len(self._step) - 1
-        k = np.clip(nearest[:, None] + np.array([-1, 0, 1]), 0, last)
+        k = np.clip(middle[:, None] + np.array([-1, 0, 1]), 0, last)
         step = self._step[k]
         gap = points[:, None] - self._start[k]
         share = (gap * step).sum(-1) / np.maximum((step**2).sum(-1), 1e-12)

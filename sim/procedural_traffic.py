@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sim.procedural_geometry import nearest
 from sim.procedural_map import DrivingPath, Layout, Signal
 from sim.scene import ObjectType
 
@@ -86,13 +87,11 @@ def tabulate(paths: tuple[DrivingPath, ...]) -> PathTables:
     near = np.zeros((count, count, longest, 4))
     apart = np.zeros((count, count, longest))
     flat_x, flat_y, flat_yaw = x.ravel(), y.ravel(), yaw.ravel()
-    # |p - q|^2 less |q|^2 as one product; float32 picks a neighbour at worst.
-    lean = np.stack([flat_x, flat_y, np.ones_like(flat_x)], -1).astype(np.float32)
+    flat = np.stack([flat_x, flat_y], axis=-1)
     for p, path in enumerate(paths):
         real = len(path.yaw[:: stride[p]])
         px, py, pyaw = x[p, :real], y[p, :real], yaw[p, :real]
-        samples = np.stack([-2 * px, -2 * py, px**2 + py**2]).astype(np.float32)
-        k = (lean @ samples).argmin(axis=1)
+        k = nearest(flat, np.stack([px, py], axis=-1))
         rx, ry = flat_x - px[k], flat_y - py[k]
         cos, sin = np.cos(pyaw[k]), np.sin(pyaw[k])
         along, left = rx * cos + ry * sin, ry * cos - rx * sin
@@ -147,7 +146,8 @@ class _Drive:
         self.grid = np.array([p.step * max(1, round(_GRID / p.step)) for p in paths])
         self.rank = np.array([1000.0 * p.rank for p in paths])
         self.rank += 0.001 * np.arange(len(paths))
-        self.pending = np.array([path.must_stop for path in paths])
+        self.sign = np.array([path.must_stop for path in paths])
+        self.pending = self.sign.copy()
         self.arrival = np.full(len(paths), np.inf)
         self.length, self.width = fleet.size[:, 0], fleet.size[:, 1]
         self.row, self.column = own[:, None], own[None, :]
@@ -176,6 +176,10 @@ class _Drive:
             wanted = np.minimum(wanted, np.maximum(self._follow(v, gap, lead), -2.5))
         elif self.crosses:
             gap = self._yield(s, v, alive, held)
+            # At a stop sign one waits at the line until the whole way is free.
+            front = self.stop - s - self.length / 2
+            waits = self.sign & (front > -0.5) & (gap < _FAR)
+            gap = np.where(waits, np.minimum(gap, np.maximum(front, 0.3) + 1.0), gap)
             wanted = np.minimum(wanted, self._follow(v, gap, np.zeros_like(v)))
         return np.where(self.walker, 0.0, wanted)
 
