@@ -239,11 +239,9 @@ class Writer:
                 self._error = error
                 self._changed.notify_all()
                 return
-            if (reply.writer, reply.epoch) != (self._writer, self._epoch):
-                return
             if reply.status in (Status.STALE, Status.REFUSED):
                 self._error = ReplayError(f"replay refused the rows: {reply.reason}")
-            else:
+            elif (reply.writer, reply.epoch) == (self._writer, self._epoch):
                 self._failures = 0
                 self._forget_below(reply.next_sequence)
                 if reply.status is not Status.OK and generation == self._generation:
