@@ -1,7 +1,7 @@
 """Prioritised double DQN as Acme trains it: one update, and the loop around it.
 
-The defaults of `LearnerConfig` are the Waymax paper's (appendix A.2) and, where it is
-silent, Acme's. One update, for a batch drawn with probabilities P:
+Settings and their sources stand in `learner.config`. One update, for a batch drawn
+with probabilities P:
 
     q_tm1, q_online_t = online(s_tm1), online(s_t)      q_target_t = target(s_t)
     loss = mean(w l) as in `learner.targets`, with the reward clipped
@@ -16,8 +16,7 @@ network, target, optimiser and the counter are the whole state.
 import functools
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, final, runtime_checkable
+from typing import NamedTuple, Protocol, final, runtime_checkable
 
 import numpy as np
 import torch
@@ -25,80 +24,11 @@ from jaxtyping import Float, Int, UInt
 from torch import Tensor
 
 from actors.network import Layout, NetworkConfig, parameter_layout
+from learner.config import LearnerConfig
 from learner.losses import LossFunction, QBatch, TorchrlLosses, plain_losses
 from learner.network import QNetwork, to_torch, to_vector
 from learner.targets import importance_weights, weighted_mean
 from sim.observation import Observation, ObservationSizes
-
-
-@dataclass(frozen=True, kw_only=True)
-class LearnerConfig:
-    """What the learner does with a batch. Defaults: the paper's, else Acme's."""
-
-    learning_rate: float = 5e-5
-    """Adam's step size."""
-
-    adam_epsilon: float = 1e-8
-    """Added to Adam's denominator."""
-
-    batch_size: int = 64
-    """Transitions per update."""
-
-    discount: float = 0.99
-    """Gamma; multiplies each row's discount, which is 0 at a terminal state."""
-
-    target_period: int = 100
-    """Updates between two copies of the network to the target network."""
-
-    importance_exponent: float = 0.2
-    """Beta of the weights (1 / P)^beta; 0 switches them off."""
-
-    huber_threshold: float = 1.0
-    """|TD error| at which the loss turns from quadratic to linear."""
-
-    reward_clip: float = 1.0
-    """Rewards are clipped to plus or minus this."""
-
-    max_gradient_norm: float = 0.0
-    """Gradients are scaled down to this norm over all parameters; 0 means never."""
-
-    loss: Literal["torchrl", "plain"] = "torchrl"
-    """Whose arithmetic: torchrl's `DQNLoss`, or the same in plain torch, which is
-    faster and equal to it by test."""
-
-    publish_period: int = 50
-    """Updates between two publications of the weights to the actors."""
-
-    torch_threads: int = 1
-    """Threads of torch in the learner's process."""
-
-    device: str = "cpu"
-    """Where torch computes: cpu, cuda, cuda:1, ..."""
-
-    seed: int = 0
-    """Seed of the network's first weights."""
-
-    def __post_init__(self) -> None:
-        """Refuses settings under which nothing is learnt."""
-        for name in (
-            "learning_rate",
-            "adam_epsilon",
-            "batch_size",
-            "target_period",
-            "huber_threshold",
-            "reward_clip",
-            "publish_period",
-            "torch_threads",
-        ):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}={getattr(self, name)} must be above 0")
-        if not 0 <= self.discount <= 1:
-            raise ValueError(f"discount={self.discount} must be within 0 and 1")
-        if self.importance_exponent < 0 or self.max_gradient_norm < 0:
-            raise ValueError(
-                f"importance_exponent={self.importance_exponent} and "
-                f"max_gradient_norm={self.max_gradient_norm} must not be negative"
-            )
 
 
 class Batch(NamedTuple):
