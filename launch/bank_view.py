@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float, Int
 
-from launch.frame_view import ActionLabels
 from launch.scene_view import SceneSource, ViewScene
+from launch.words import ActionLabels
 from sim.bank import BankFile
 from sim.convert import LOG_FIELDS
 from sim.dynamics import ActionConfig, ActionSpace, action_table

@@ -1,7 +1,7 @@
 """The frames of one watched environment as Rerun entities.
 
     ROOT/camera             transform that keeps the controlled object in the middle
-    ROOT/vehicles, ROOT/pedestrians, ROOT/cyclists   recorded objects, true size
+    ROOT/objects            recorded objects, true size, coloured by type
     ROOT/marks              windscreens and rear windows: which way a box faces
     ROOT/ego                the controlled object; red while it overlaps or is off-road
     ROOT/recorded           outline of where the log has the controlled object
@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from launch.bars import bar_colour, vectors
 from launch.map_view import log_map
 from launch.scene_view import Colour, ViewScene, log_lights, send
+from launch.words import ActionLabels, describe
 from sim.scene import ObjectType
 
 EGO: Colour = (38, 166, 255, 255)
@@ -39,11 +40,7 @@ PEDESTRIAN: Colour = (255, 179, 71, 255)
 CYCLIST: Colour = (198, 134, 255, 255)
 GLASS: Colour = (38, 43, 51, 255)
 
-_ROLES: tuple[tuple[str, tuple[ObjectType, ...], Colour], ...] = (
-    ("vehicles", (ObjectType.VEHICLE, ObjectType.OTHER, ObjectType.UNSET), VEHICLE),
-    ("pedestrians", (ObjectType.PEDESTRIAN,), PEDESTRIAN),
-    ("cyclists", (ObjectType.CYCLIST,), CYCLIST),
-)
+_SMALL = {int(ObjectType.PEDESTRIAN): PEDESTRIAN, int(ObjectType.CYCLIST): CYCLIST}
 # Windscreen and rear window: centre and length along the car over its length, and
 # width over its width. Seen from above they say where a box's front is.
 _WINDOWS = ((0.17, 0.11, 0.80), (-0.40, 0.06, 0.72))
@@ -57,21 +54,6 @@ Boxes = tuple[
     Float[np.ndarray, " boxes"],
 ]
 """Centres, sizes and yaws."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ActionLabels:
-    """What the indices of a discrete action space mean."""
-
-    names: tuple[str, ...]  # of the dimensions, e.g. "acceleration [m/s2]"
-    values: Float[np.ndarray, "actions dimensions"]
-
-    def describe(self, index: int) -> tuple[tuple[str, str], ...]:
-        """An action as pairs of a name and a value."""
-        if not 0 <= index < len(self.values):
-            return ()
-        pairs = zip(self.names, self.values[index], strict=True)
-        return tuple((name, f"{value:+.3g}") for name, value in pairs)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,10 +94,10 @@ def _send_boxes(
     recording: rr.RecordingStream,
     entity: str,
     at: Int[np.ndarray, " frames"],
-    frames: Sequence[tuple[Boxes, Colour]],
+    frames: Sequence[tuple[Boxes, list[Colour]]],
     fill: rr.components.FillMode = rr.components.FillMode.Solid,
 ) -> None:
-    """Sends a set of boxes of one colour for each frame."""
+    """Sends boxes and their colours for each frame."""
     lengths = [len(boxes[0]) for boxes, _ in frames]
     centres, sizes, yaws = (
         np.concatenate([boxes[part] for boxes, _ in frames]) for part in range(3)
@@ -124,7 +106,7 @@ def _send_boxes(
         centers=centres,
         half_sizes=sizes / 2,
         quaternions=quaternions(yaws),
-        colors=[colour for boxes, colour in frames for _ in range(len(boxes[0]))],
+        colors=[colour for _, colours in frames for colour in colours],
         fill_mode=[fill] * sum(lengths),
         radii=np.full(sum(lengths), 0.08, np.float32),
     )
@@ -171,7 +153,9 @@ class EnvironmentView:
             self._trail = np.zeros((0, 3), np.float32)
             self._return = 0.0
             log_map(self._recording, self._root, scene, int(piece.at[0]))
-        log_lights(self._recording, self._root, scene, piece.frames["step"], piece.at)
+        if piece.begins or len(scene.light_points):
+            steps = piece.frames["step"]
+            log_lights(self._recording, self._root, scene, steps, piece.at)
         self._log_objects(scene, piece)
         self._log_paths(scene, piece)
         self._log_plots(scene, piece)
@@ -180,37 +164,40 @@ class EnvironmentView:
     def _log_objects(self, scene: ViewScene, piece: Piece) -> None:
         """Boxes of everyone, with their windows."""
         steps = np.clip(piece.frames["step"], 0, scene.valid.shape[1] - 1)
-        shown: list[list[tuple[Boxes, Colour]]] = [[] for _ in _ROLES]
-        egos: list[tuple[Boxes, Colour]] = []
-        recorded: list[tuple[Boxes, Colour]] = []
-        marks: list[tuple[Boxes, Colour]] = []
-        for frame, step in zip(piece.frames, steps, strict=True):
+        windowed = ~np.isin(scene.object_types, list(_SMALL))
+        colours = [_SMALL.get(int(kind), VEHICLE) for kind in scene.object_types]
+        shown: dict[str, list[tuple[Boxes, list[Colour]]]] = {
+            name: [] for name in ("objects", "ego", "marks", "recorded")
+        }
+        for frame, step in zip(piece.frames, steps.tolist(), strict=True):
             present = scene.valid[:, step].copy()
-            ego = _ego_box(scene, frame, int(step))
-            failed = bool(frame["overlap"]) or bool(frame["offroad"])
-            egos.append((ego, FAILED if failed else EGO))
             only = np.zeros_like(present)
             only[frame["controlled"]] = present[frame["controlled"]]
-            recorded.append((_boxes(scene, int(step), only), RECORDED))
             present[frame["controlled"]] = False
-            cars = []
-            for role, (_, types, colour) in zip(shown, _ROLES, strict=True):
-                of_role = present & np.isin(scene.object_types, types)
-                role.append((_boxes(scene, int(step), of_role), colour))
-                cars.append(role[-1][0])
-            glazed = windows_of(_joined([cars[0], ego]))
-            marks.append((glazed, GLASS))
-        for (name, _, _), role in zip(_ROLES, shown, strict=True):
-            _send_boxes(self._recording, f"{self._root}/{name}", piece.at, role)
-        _send_boxes(self._recording, f"{self._root}/ego", piece.at, egos)
-        _send_boxes(self._recording, f"{self._root}/marks", piece.at, marks)
-        _send_boxes(
-            self._recording,
-            f"{self._root}/recorded",
-            piece.at,
-            recorded,
-            rr.components.FillMode.MajorWireframe,
-        )
+            ego = _ego_box(scene, frame, step)
+            failed = bool(frame["overlap"]) or bool(frame["offroad"])
+            windows = windows_of(
+                _joined([_boxes(scene, step, present & windowed), ego])
+            )
+            objects = _boxes(scene, step, present)
+            shown["objects"].append(
+                (objects, [colours[row] for row in np.flatnonzero(present)])
+            )
+            shown["ego"].append((ego, [FAILED if failed else EGO]))
+            shown["marks"].append((windows, [GLASS] * len(windows[0])))
+            shown["recorded"].append(
+                (_boxes(scene, step, only), [RECORDED] * int(only.sum()))
+            )
+        for name, frames in shown.items():
+            outline = name == "recorded"
+            fill = rr.components.FillMode
+            _send_boxes(
+                self._recording,
+                f"{self._root}/{name}",
+                piece.at,
+                frames,
+                fill.MajorWireframe if outline else fill.Solid,
+            )
 
     def _log_paths(self, scene: ViewScene, piece: Piece) -> None:
         """Camera, trail and route."""
@@ -288,7 +275,7 @@ class EnvironmentView:
         """The panel of words."""
         texts = []
         for frame, q in zip(piece.frames, piece.q_values, strict=True):
-            texts.append(_describe(scene, frame, q, (piece.title, self._actions)))
+            texts.append(describe(scene, frame, q, (piece.title, self._actions)))
         columns = rr.TextDocument.columns(
             text=texts, media_type=["text/markdown"] * len(texts)
         )
@@ -316,11 +303,6 @@ class EnvironmentView:
         bars = f"{self._root}/q_bars"
         for name, colour in (("all", (104, 114, 128, 255)), ("chosen", EGO)):
             self._recording.log(f"{bars}/{name}", bar_colour(colour), static=True)
-
-
-def _percent(share: float) -> str:
-    """A share as a percentage; NaN is none."""
-    return "-" if np.isnan(share) else f"{100 * share:.0f} %"
 
 
 def _boxes(scene: ViewScene, step: int, chosen: Bool[np.ndarray, " objects"]) -> Boxes:
@@ -362,39 +344,3 @@ def _route_ahead(
     lifted = ahead.copy()
     lifted[:, 2] = ground[2] + _ROUTE_HEIGHT
     return lifted
-
-
-def _describe(
-    scene: ViewScene,
-    frame: np.void,
-    q_values: Float[np.ndarray, " actions"],
-    who: tuple[str, ActionLabels | None],
-) -> str:
-    """One step in words, as markdown."""
-    title, labels = who
-    action = int(frame["action"])
-    meaning = labels.describe(action) if labels is not None else ()
-    failures = [
-        name
-        for name, failed in (
-            ("overlap", frame["overlap"]),
-            ("off-road", frame["offroad"]),
-        )
-        if failed
-    ]
-    speed = float(np.hypot(*frame["state"][3:]))
-    known = len(q_values) > 0 and action >= 0
-    rows = (
-        ("scenario", f"`{scene.scenario_id}`"),
-        ("---", "---"),
-        ("step", f"{int(frame['step'])} ({frame['step'] * scene.dt:.1f} s)"),
-        ("speed", f"{speed:.1f} m/s"),
-        ("action", str(action) if action >= 0 else "-"),
-        *meaning,
-        ("Q-value", f"{q_values[action]:.3f}" if known else "-"),
-        ("reward", f"{frame['reward']:+.3f}"),
-        ("progress", _percent(float(frame["progress"]))),
-        ("failures", f"**{' and '.join(failures)}**" if failures else "none"),
-    )
-    table = "\n".join(f"| {name} | {value} |" for name, value in rows)
-    return f"#### {title}\n\n{table}\n"

@@ -6,20 +6,26 @@ its destination under a temporary name and renamed when it is whole.
 """
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from actors.frames import FrameBatch
+from actors.evaluation import Evaluation
+from actors.frames import FrameBatch, make_frames
 from launch.blueprint import layout, new_recording
-from launch.frame_view import ActionLabels, EnvironmentView, Piece
+from launch.frame_view import EnvironmentView, Piece
 from launch.scene_view import SceneSource
+from launch.words import ActionLabels
+from sim.bank import BankFile
 
 ROOT = "/evaluation"
 PAUSE = 8  # rows of the timeline that the last frame of a rollout stays
 _CHUNK = 32  # frames; pieces smaller than a rollout seek faster in a browser
+# The file ends with an index of its chunks: measured, 610 bytes for each, and a piece
+# makes up to 27.
+_FOOTER_PER_PIECE = 16_500
 
 
 class RecordingError(Exception):
@@ -36,6 +42,52 @@ class RecordingConfig:
     """Rollouts recorded at most."""
     frames_per_second: float = 10.0
     """Speed of playback; 10 is the scenes' own."""
+
+
+def rollouts_of(
+    evaluation: Evaluation, file: BankFile
+) -> Iterator[tuple[str, FrameBatch]]:
+    """The rollouts of an evaluation that kept its trace: the SDC's, scene by scene.
+
+    A rollout ends with the last step that counts.
+    """
+    trace = evaluation.trace
+    if trace is None:
+        raise RecordingError(
+            f"the evaluation of {evaluation.agent} kept no trace to record: evaluate "
+            "with keep_trace=True"
+        )
+    for scene in range(file.scenes):
+        sdc = int(file.arrays["sdc"][scene])
+        column = sdc if trace.counts.shape[2] > 1 else 0
+        counts = np.asarray(trace.counts)[scene, :, column]
+        if not counts.any():
+            continue
+        steps = slice(0, int(np.flatnonzero(counts)[-1]) + 1)
+        values = {
+            name: np.asarray(getattr(trace, name))[scene, steps, column]
+            for name in ("states", "action", "reward", "overlap", "offroad", "progress")
+        }
+        step = np.asarray(trace.step)[scene, steps]
+        frames = make_frames(
+            len(step),
+            scene=scene,
+            step=step,
+            controlled=sdc,
+            state=values.pop("states"),
+            **values,
+        )
+        yield (
+            evaluation.agent,
+            FrameBatch(
+                actor=0,
+                environment=0,
+                actor_steps=0,
+                weights_version=-1,
+                frames=frames,
+                q_values=np.asarray(trace.q_values)[scene, steps, column],
+            ),
+        )
 
 
 @dataclass(frozen=True)
@@ -97,19 +149,19 @@ def _write(
         layout([ROOT], play_state="playing", frames_per_second=config.frames_per_second)
     )
     view = EnvironmentView(recording=recording, root=ROOT, actions=actions)
-    count, frames, at = 0, 0, 0
+    count, frames, at, pieces = 0, 0, 0, 0
     before, largest = 0, 0
     for title, batch in rollouts:
         recording.flush()
-        size = path.stat().st_size
+        size = path.stat().st_size + pieces * _FOOTER_PER_PIECE
         largest, before = max(largest, size - before), size
-        if count >= config.max_rollouts:
-            break
-        if count and size + 1.25 * largest > config.max_bytes:
+        full = count and size + 1.25 * largest > config.max_bytes
+        if full or count >= config.max_rollouts:
             break
         _log_rollout(view, scene_of, (f"Rollout {count + 1}: {title}", batch), at)
         count, frames = count + 1, frames + len(batch)
         at += len(batch) + PAUSE
+        pieces += -(-len(batch) // _CHUNK)
     recording.flush()
     recording.disconnect()
     return count, frames

@@ -24,20 +24,21 @@ from jaxtyping import Bool, Shaped
 
 from actors.frames import FrameBatch, FrameError, decode_frames
 from launch.blueprint import layout, new_recording
-from launch.frame_view import ActionLabels, EnvironmentView, Piece
+from launch.frame_view import EnvironmentView, Piece
 from launch.scene_view import SceneSource
 from launch.web import WebConfig, WebViewer
+from launch.words import ActionLabels
 
 
 @dataclass(frozen=True, kw_only=True)
 class ViewerConfig:
     """What is shown, how fast and where."""
 
-    environments: int = 4
+    environments: int = 2
     """Environments shown; the first that send frames."""
     frames_per_second: float = 10.0
     """Pace of the playback; 10 is the scenes' own."""
-    buffer_s: float = 0.2
+    buffer_s: float = 0.5
     """Frames are sent to the browser this often."""
     backlog_s: float = 2.0
     """An episode is skipped while this much of its environment waits to be shown."""

@@ -42,7 +42,7 @@ class WebConfig:
     """Port of the page to open in a browser."""
     data_port: int = 9876
     """Port that the page gets its data from (gRPC if live, HTTP if recorded)."""
-    server_memory: str = "512MB"
+    server_memory: str = "128MB"
     """What is kept for browsers that join late; the oldest is dropped first."""
     insecure: bool = False
     """Allows an address that others can reach; nothing is encrypted."""
@@ -130,6 +130,7 @@ class WebViewer:
             *("--port", str(config.data_port)),
             *("--server-memory-limit", config.server_memory),
             *("--cors-allow-origin", page),
+            "--newest-first",
             *([source] if source else []),
         ]
         self._live = source is None
