@@ -361,7 +361,7 @@ def _walk_across(
     waits = control.stops[k % 2]
     if control.lights:
         waits = bool((shown[control.group(k, _AHEAD)] == Signal.STOP).all())
-    if not waits or rng.random() > 0.6:
+    if not waits or rng.random() > (0.6 if control.lights else 0.3):
         return
     far = leg.half + 12.0
     side = rng.choice([-1.0, 1.0])

@@ -154,6 +154,14 @@ def _unit_turn(angle: float) -> Float[np.ndarray, "n 2"]:
     return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
+def _straight(
+    start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "n 2"]:
+    """Samples about every `STEP` metres from one point to another."""
+    count = max(1, round(float(np.hypot(*(end - start))) / STEP))
+    return np.linspace(start, end, count + 1)
+
+
 def turn(
     start: Float[np.ndarray, "2"],
     start_yaw: float,
@@ -170,7 +178,7 @@ def turn(
     forward = np.array([np.cos(start_yaw), np.sin(start_yaw)])
     onward = np.array([np.cos(end_yaw), np.sin(end_yaw)])
     if abs(np.sin(angle)) < 1e-3:
-        return np.stack([start, end])
+        return _straight(start, end)
     gap = end - start
     cross = forward[0] * onward[1] - forward[1] * onward[0]
     to_corner = float(gap[0] * onward[1] - gap[1] * onward[0]) / cross
@@ -181,6 +189,6 @@ def turn(
     rotation = np.array([forward, [-forward[1], forward[0]]])
     begin = start + (to_corner - tangent) * forward
     bend = begin + (tangent / unit_tangent) * unit @ rotation
-    joined = np.concatenate([start[None], bend, end[None]])
+    joined = np.concatenate([_straight(start, begin), bend, _straight(bend[-1], end)])
     keep = np.hypot(*np.diff(joined, axis=0).T) > 1e-6
     return joined[np.concatenate([[True], keep])]

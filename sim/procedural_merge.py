@@ -6,7 +6,7 @@ right: f(u) metres beyond its acceleration lane, a parabola that ends in a strai
 
     f(x) = x^2 / 2R  for x < x_1,   then with the slope x_1 / R,   x = u_join - u.
 
-Between the kerbs of ramp and highway the edge runs to the nose, where they meet.
+Between the kerbs of ramp and highway the edge runs to a blunt nose.
 """
 
 import itertools
@@ -55,9 +55,9 @@ class _Highway:
         return self.centre(self.lanes) - away
 
     def nose(self) -> float:
-        """Station where the kerbs of ramp and highway meet."""
+        """Station where the kerbs of ramp and highway come within half a metre."""
         inner = self.ramp() + self.lane / 2 + 1.0
-        apart = inner < -self.lanes * self.lane - self.shoulder
+        apart = inner < -self.lanes * self.lane - self.shoulder - 0.5
         return STEP * float(apart.sum() - 1)
 
     def right_edge(self) -> Float[np.ndarray, " n"]:

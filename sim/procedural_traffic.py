@@ -176,10 +176,6 @@ class _Drive:
             wanted = np.minimum(wanted, np.maximum(self._follow(v, gap, lead), -2.5))
         elif self.crosses:
             gap = self._yield(s, v, alive, held)
-            # At a stop sign one waits at the line until the whole way is free.
-            front = self.stop - s - self.length / 2
-            waits = self.sign & (front > -0.5) & (gap < _FAR)
-            gap = np.where(waits, np.minimum(gap, np.maximum(front, 0.3) + 1.0), gap)
             wanted = np.minimum(wanted, self._follow(v, gap, np.zeros_like(v)))
         return np.where(self.walker, 0.0, wanted)
 
@@ -284,9 +280,17 @@ class _Drive:
         goes = (order[None, :] < order[:, None]) & ~held[None, :]
         inside = (entry.T <= 0) & (clear.T > 0)
         possible = v[:, None] ** 2 < 2 * 5.0 * np.maximum(entry - 0.3, 0.01)
-        must = meet & (goes | inside) & (clear.T > 0) & (entry > 0) & possible
-        must &= alive[None, :] & (self.enter < _FAR)
-        return np.where(must, entry, _FAR).min(axis=1) + 1.0
+        may = meet & (clear.T > 0) & (entry > 0) & possible
+        may &= alive[None, :] & (self.enter < _FAR)
+        # At a stop sign one waits at the line until the whole way is free; who waits
+        # there for somebody on foot lets the others go meanwhile.
+        front = self.stop - s - self.length / 2
+        waits = self.sign & (front > -0.5)
+        aside = waits & (may & self.walker[None, :]).any(axis=1)
+        must = may & ((goes & ~aside[None, :]) | inside)
+        gap = np.where(must, entry, _FAR).min(axis=1)
+        line = np.where(waits & (gap < _FAR), np.maximum(front, 0.3), _FAR)
+        return np.minimum(gap, line) + 1.0
 
 
 def _arrive(
