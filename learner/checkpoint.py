@@ -97,6 +97,9 @@ def latest_checkpoint(folder: Path) -> Path | None:
         name = (folder / LATEST).read_text().strip()
     except FileNotFoundError:
         return None
+    aside = folder / f"{PARTIAL}{name}-old"
+    if name.isdigit() and aside.is_dir() and not (folder / name).exists():
+        os.rename(aside, folder / name)  # killed between the renames of a replacement
     if not name.isdigit() or not (folder / name).is_dir():
         raise CheckpointError(
             f"{folder / LATEST}: names no checkpoint here ({name[:40]!r}); "

@@ -150,6 +150,23 @@ def test_a_save_cut_short_leaves_the_older_in_force(tmp_path, monkeypatch, name)
     assert not list(tmp_path.glob(".partial*"))
 
 
+def test_a_replacement_cut_between_its_renames_is_undone(tmp_path, monkeypatch):
+    save_checkpoint(tmp_path, learner=make_learner(), extra={"run": 1})
+    rename = checkpoint.os.rename
+
+    def cut(source, destination):
+        if destination.name == "000000000":
+            raise KeyboardInterrupt
+        rename(source, destination)
+
+    monkeypatch.setattr(checkpoint.os, "rename", cut)
+    with pytest.raises(KeyboardInterrupt):
+        save_checkpoint(tmp_path, learner=make_learner(), extra={"run": 2})
+    monkeypatch.undo()
+    path = latest_checkpoint(tmp_path)
+    assert load_checkpoint(path, learner=make_learner())["extra"] == {"run": 1}
+
+
 def one_line(error):
     assert "\n" not in str(error.value)
 
