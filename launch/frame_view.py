@@ -49,9 +49,7 @@ _MAX_TRAIL = 400  # points; a longer trail forgets its beginning
 _ROUTE_HEIGHT, _TRAIL_HEIGHT = 0.05, 0.12
 
 Boxes = tuple[
-    Float[np.ndarray, "boxes 3"],
-    Float[np.ndarray, "boxes 3"],
-    Float[np.ndarray, " boxes"],
+    Float[np.ndarray, "_ 3"], Float[np.ndarray, "_ 3"], Float[np.ndarray, " _"]
 ]
 """Centres, sizes and yaws."""
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
-from jaxtyping import Float, Int
+from jaxtyping import Float, UInt
 
 from launch.scene_view import Colour, ViewScene, send
 from sim.scene import RoadKind
@@ -147,7 +147,7 @@ def stripes(points: Float[np.ndarray, "points 3"]) -> Strips:
 
 def surface_mesh(
     lanes: Strips,
-) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "triangles 3"]]:
+) -> tuple[Float[np.ndarray, "vertices 3"], UInt[np.ndarray, "triangles 3"]]:
     """The lanes' surface: two vertices per centre point, two triangles per segment."""
     vertices: Strips = [np.zeros((0, 3), np.float32)]
     triangles = [np.zeros((0, 3), np.uint32)]

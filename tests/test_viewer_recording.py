@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 
 from actors.evaluation import Evaluation, Trace
@@ -28,6 +29,8 @@ from sim import bank, procedural
 from sim.bank import BankFile
 from sim.dynamics import ActionConfig
 from sim.scene import RoadKind
+
+rr.set_strict_mode(True)  # a warning of Rerun's is an entity that is not shown
 
 STEPS = 20
 ACTIONS = ActionConfig().count
