@@ -109,9 +109,7 @@ def run_actor(
     """
     start_key, key = jax.random.split(key)
     act = jax.jit(
-        functools.partial(
-            acting.act, config=acting_config, watched=config.watched
-        )
+        functools.partial(acting.act, config=acting_config, watched=config.watched)
     )
     epsilon = jnp.asarray(
         acting.epsilons(

@@ -136,7 +136,9 @@ def evaluate(
         ]
         if keep_trace:
             traces.append(trace)
-    joined = jax.tree.map(lambda *parts: np.concatenate(parts), *traces) if traces else None
+    joined = (
+        jax.tree.map(lambda *parts: np.concatenate(parts), *traces) if traces else None
+    )
     return Evaluation(agent=name, scenes=results, trace=joined)
 
 
@@ -153,9 +155,7 @@ def _rollout(
         first = jnp.int32(0) if from_first_step else bank.current_step[scene]
         state = start_at(bank, scene, first, controlled, config)
 
-        def step(
-            carry: State, step_key: PRNGKeyArray
-        ) -> tuple[State, Trace]:
+        def step(carry: State, step_key: PRNGKeyArray) -> tuple[State, Trace]:
             following, trace = _step(step_key, bank, carry, agent, config)
             return following, trace
 

@@ -126,8 +126,6 @@ def expert(config: EnvironmentConfig, through: ExpertSpace) -> Agent:
             ObjectState(*logged.T),
             ObjectState(*following.T),
         )
-        return Decision(
-            moved, action, jnp.zeros((action.shape[0], 0), jnp.float32)
-        )
+        return Decision(moved, action, jnp.zeros((action.shape[0], 0), jnp.float32))
 
     return act

@@ -28,7 +28,7 @@ from sim import convert
 from sim.scene import Scene
 
 MAGIC = b"SLIPBANK"
-VERSION = 1
+VERSION = 2
 ALIGNMENT = 4096
 
 
@@ -55,16 +55,17 @@ class Bank(NamedTuple):
     lights: Int[Array, " scenes"]  # lights of the scene
     grid_origin: Float[Array, "scenes 2"]  # m
     grid_shape: Int[Array, "scenes 2"]  # cells along x and y
-    cell_start: Int[Array, " scenes"]  # first row of `cell_rows`
-    fine_start: Int[Array, " scenes"]  # first element of `fine_state`
+    cell_start: Int[Array, " scenes"]  # first element of `cell_row`, `cell_edges`
+    cell_row: Int[Array, " cells"]  # row of `rows`, -1: the map is out of reach
+    rows: UInt[Array, "kept rows"]  # segments by distance, of the scene's own
+    row_count: UInt[Array, " kept"]  # how many of them there are
     segment_start: Int[Array, " scenes"]  # first row of `segments`
     segments: Float[Array, "segments 4"]  # m, x0 y0 x1 y1
     segment_kind: Int[Array, " segments"]  # `RoadKind`
-    cell_rows: UInt[Array, "cells rows"]  # segments by distance, of the scene's own
-    cell_count: UInt[Array, " cells"]  # how many of them there are
-    fine_state: Int[Array, " fine"]  # -1 drivable, -2 not, else row of `fine_edges`
-    fine_edges: Int[Array, "mixed candidates"]  # rows of `edges`, repeated to fill
-    edges: Float[Array, "edges 10"]  # m, `sim.tables.Edges.packed`
+    cell_edges: Int[Array, " cells"]  # -1 drivable, -2 not, else row of `fine_state`
+    fine_state: Int[Array, "mixed parts"]  # -1, -2, else row of `fine_edges`
+    fine_edges: Int[Array, "decisive candidates"]  # rows of `edges`, repeated to fill
+    edges: Float[Array, "edges 10"]  # m, `sim.edge_table.Edges.packed`
 
 
 @dataclass(frozen=True)

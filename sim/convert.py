@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sim import tables
-from sim.scene import RoadKind, Scene
+from sim import edge_table, tables
+from sim.scene import Scene
 
 LOG_FIELDS = ("x", "y", "z", "yaw", "v_x", "v_y", "length", "width")
 ROUTE_POINTS = 64
@@ -14,7 +14,6 @@ ROUTE_AHEAD = 40.0  # m that a route goes on straight behind the log's end
 ROUTE_STEP = 0.5  # m: shorter moves are jitter of a standing object
 ROWS = 64  # road segments kept per cell
 MAX_CANDIDATES = 32  # edges per fine cell; measured: 12 to 30 at the 99th percentile
-DRIVABLE, UNDRIVABLE = -1, -2
 
 
 def origin_of(scene: Scene) -> Float[np.ndarray, "3"]:
@@ -30,16 +29,15 @@ def convert(scene: Scene) -> dict[str, Any]:
     origin = origin_of(scene)
     log, valid = _log(scene, origin)
     grid = tables.grid_of(scene)
-    ground = np.concatenate(
-        [line.points for line in scene.roads] or [np.zeros((1, 3))]
-    )
+    ground = np.concatenate([line.points for line in scene.roads] or [np.zeros((1, 3))])
     route, spacing, start, end = _routes(log, valid, scene.current_step)
     segments, kinds = tables.row_segments(scene.roads)
     _check_small(scene, "road segments", len(segments), 2**16)
-    rows, counts = tables.row_table(grid, segments, ROWS)
-    edges = tables.edges_of(scene.roads)
-    state, candidates = tables.edge_table(grid, edges, ground)
-    fine_state, fine_edges = _candidate_rows(state, candidates)
+    row_of, rows, counts = tables.row_table(grid, segments, ROWS)
+    edges = edge_table.edges_of(scene.roads)
+    state, candidates = edge_table.edge_table(grid, edges, ground)
+    fine, fine_edges = _candidate_rows(state, candidates)
+    cell_edges, fine_state = _nested(fine.reshape(grid.fine.shape))
     return {
         "current_step": np.int32(scene.current_step),
         "steps": np.int32(scene.steps),
@@ -58,8 +56,10 @@ def convert(scene: Scene) -> dict[str, Any]:
         "grid_shape": np.array(grid.shape, np.int32),
         "segments": (segments - np.tile(origin[:2], 2)).astype(np.float32),
         "segment_kind": kinds,
-        "cell_rows": rows,
-        "cell_count": counts,
+        "cell_row": row_of,
+        "rows": rows,
+        "row_count": counts,
+        "cell_edges": cell_edges,
         "fine_state": fine_state,
         "fine_edges": fine_edges,
         "edges": _moved(edges, origin).packed(),
@@ -74,17 +74,15 @@ def _check_small(scene: Scene, what: str, count: int, limit: int) -> None:
         )
 
 
-def _moved(edges: tables.Edges, origin: Float[np.ndarray, "3"]) -> tables.Edges:
-    return tables.Edges(
+def _moved(edges: edge_table.Edges, origin: Float[np.ndarray, "3"]) -> edge_table.Edges:
+    return edge_table.Edges(
         edges.start - origin, edges.along, edges.previous, edges.following
     )
 
 
 def _log(
     scene: Scene, origin: Float[np.ndarray, "3"]
-) -> tuple[
-    Float[np.ndarray, "steps objects 8"], Bool[np.ndarray, "steps objects"]
-]:
+) -> tuple[Float[np.ndarray, "steps objects 8"], Bool[np.ndarray, "steps objects"]]:
     """The log by step; where an object is not valid it keeps its nearest valid row.
 
     Keeping a row matters for size and height, which a controlled object that outlives
@@ -162,10 +160,12 @@ def _knots(
 def _candidate_rows(
     state: Int[np.ndarray, " fine"], candidates: list[Int[np.ndarray, " edges"]]
 ) -> tuple[Int[np.ndarray, " fine"], Int[np.ndarray, "mixed width"]]:
-    """One row per mixed cell; a shorter list repeats its first edge."""
-    result = np.where(state == tables.DRIVABLE, DRIVABLE, UNDRIVABLE).astype(np.int32)
-    mixed = np.flatnonzero(state == tables.MIXED)
-    result[mixed] = np.arange(len(mixed))
+    """A row of candidates per mixed fine cell, and each fine cell's row or verdict.
+
+    A list shorter than the longest repeats its first edge, which changes no minimum.
+    """
+    mixed = np.flatnonzero(state == edge_table.MIXED)
+    state[mixed] = np.arange(len(mixed))
     longest = max((len(candidates[cell]) for cell in mixed), default=1)
     width = min(longest, MAX_CANDIDATES)
     rows = np.zeros((len(mixed), width), np.int32)
@@ -173,7 +173,24 @@ def _candidate_rows(
         near = candidates[cell][:width]
         rows[row] = near[0]
         rows[row, : len(near)] = near
-    return result, rows
+    return state, rows
+
+
+def _nested(
+    fine: Int[np.ndarray, "across along"],
+) -> tuple[Int[np.ndarray, " cells"], Int[np.ndarray, "mixed parts"]]:
+    """The fine cells as two levels: most cells are of one verdict and need no second.
+
+    The first array holds each cell's verdict, or its row of the second.
+    """
+    side = tables.FINE
+    across, along = fine.shape[0] // side, fine.shape[1] // side
+    parts = fine.reshape(across, side, along, side).transpose(0, 2, 1, 3)
+    parts = parts.reshape(across * along, side * side)
+    cells = parts[:, 0].copy()
+    mixed = np.flatnonzero((parts[:, :1] != parts).any(1) | (cells >= 0))
+    cells[mixed] = np.arange(len(mixed))
+    return cells, parts[mixed]
 
 
 def stack(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
@@ -204,25 +221,29 @@ def stack(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
         arrays[name] = np.stack([scene[name] for scene in scenes])
     arrays["lights"] = np.array([len(s["light_position"]) for s in scenes], np.int32)
     arrays["segment_start"] = _starts(scenes, "segments")
-    arrays["cell_start"] = _starts(scenes, "cell_rows")
-    arrays["fine_start"] = _starts(scenes, "fine_state")
-    mixed_start, edge_start = _starts(scenes, "fine_edges"), _starts(scenes, "edges")
-    for name in ("segments", "segment_kind", "cell_rows", "cell_count", "edges"):
+    arrays["cell_start"] = _starts(scenes, "cell_row")
+    for name in ("segments", "segment_kind", "rows", "row_count", "edges"):
         arrays[name] = np.concatenate([scene[name] for scene in scenes])
-    arrays["fine_state"] = np.concatenate(
-        [
-            np.where(s["fine_state"] >= 0, s["fine_state"] + first, s["fine_state"])
-            for s, first in zip(scenes, mixed_start, strict=True)
-        ]
-    ).astype(np.int32)
+    for name, table in (
+        ("cell_row", "rows"),
+        ("cell_edges", "fine_state"),
+        ("fine_state", "fine_edges"),
+    ):
+        arrays[name] = np.concatenate(
+            [
+                np.where(scene[name] >= 0, scene[name] + first, scene[name])
+                for scene, first in zip(scenes, _starts(scenes, table), strict=True)
+            ]
+        ).astype(np.int32)
     arrays["fine_edges"] = np.concatenate(
         [
-            _padded(s["fine_edges"] + first, (len(s["fine_edges"]), width), None)
-            for s, first in zip(scenes, edge_start, strict=True)
+            _widened(scene["fine_edges"] + first, width)
+            for scene, first in zip(scenes, _starts(scenes, "edges"), strict=True)
         ]
     ).astype(np.int32)
     # A gather needs a row to read even where no scene has a map of that kind.
-    for name in ("segments", "segment_kind", "edges", "fine_edges"):
+    tables_ = ("segments", "segment_kind", "rows", "row_count", "edges")
+    for name in (*tables_, "fine_state", "fine_edges"):
         if not len(arrays[name]):
             empty = arrays[name]
             arrays[name] = np.zeros((1, *empty.shape[1:]), empty.dtype)
@@ -234,19 +255,15 @@ def _starts(scenes: list[dict[str, Any]], name: str) -> Int[np.ndarray, " scenes
     return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32)
 
 
-def _padded(
-    array: np.ndarray, shape: tuple[int, ...], value: float | None
-) -> np.ndarray:
-    """`array` in the corner of a larger one; the rest is `value`, or its edge if None.
-
-    Repeating an edge candidate changes no minimum, so those rows pad with their first.
-    """
+def _padded(array: np.ndarray, shape: tuple[int, ...], value: float) -> np.ndarray:
+    """`array` in the corner of a larger one, the rest `value`."""
     pads = [(0, want - have) for want, have in zip(shape, array.shape, strict=True)]
-    if value is None:
-        return np.pad(array, pads, mode="edge") if array.size else np.zeros(shape)
     return np.pad(array, pads, constant_values=value)
 
 
-def kinds() -> tuple[RoadKind, ...]:
-    """The kinds of map feature that observations can hold, in one-hot order."""
-    return tables.ROW_KINDS
+def _widened(
+    rows: Int[np.ndarray, "rows have"], width: int
+) -> Int[np.ndarray, "rows want"]:
+    """Rows of candidates filled up with their first, which changes no minimum."""
+    fill = np.repeat(rows[:, :1], width - rows.shape[1], 1)
+    return np.concatenate([rows, fill], 1)

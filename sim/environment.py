@@ -143,7 +143,9 @@ def advance(
     recorded = bank.log_valid[state.scene, :, state.controlled]
     follows = recorded[:, state.step] & recorded[:, step_t]
     now = jnp.where(
-        follows[:, None], moved, logged_states(bank, state.scene, step_t, state.controlled)
+        follows[:, None],
+        moved,
+        logged_states(bank, state.scene, step_t, state.controlled),
     )
     valid = recorded[:, step_t]
     overlap, offroad = failures(bank, state.scene, step_t, state.controlled, now)

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sim import convert, tables
+from sim import edge_table, tables
 from sim.bank import Bank
 from sim.dynamics import ObjectState, bicycle_inverse
 
@@ -88,7 +88,7 @@ def offroad(
     vertex both adjoining segments decide: in a left turn the point must be left of
     both, in a right turn left of either. Corners take the height `z` of the centre
     [m], and differences of height count twice in the distance. Exact up to float32:
-    the cell's candidates hold every edge that can be the nearest (`sim.tables`).
+    the cell's candidates hold every edge that can be the nearest (`sim.edge_table`).
     """
     side = jax.vmap(_on_left, in_axes=(None, None, 0, None))
     return ~side(bank, scene, corners(box), z).all()
@@ -97,20 +97,24 @@ def offroad(
 def _on_left(
     bank: Bank, scene: Int[Array, ""], point: Float[Array, "2"], z: Float[Array, ""]
 ) -> Bool[Array, ""]:
-    shape = bank.grid_shape[scene] * tables.FINE
-    cell = ((point - bank.grid_origin[scene]) / tables.EDGE_CELL).astype(jnp.int32)
-    cell = jnp.clip(cell, 0, shape - 1)
-    state = bank.fine_state[bank.fine_start[scene] + cell[0] * shape[1] + cell[1]]
+    shape = bank.grid_shape[scene]
+    fine = ((point - bank.grid_origin[scene]) / tables.EDGE_CELL).astype(jnp.int32)
+    fine = jnp.clip(fine, 0, shape * tables.FINE - 1)
+    cell, part = fine // tables.FINE, fine % tables.FINE
+    state = bank.cell_edges[bank.cell_start[scene] + cell[0] * shape[1] + cell[1]]
+    parts = bank.fine_state[jnp.maximum(state, 0), part[0] * tables.FINE + part[1]]
+    state = jnp.where(state >= 0, parts, state)
     row = bank.edges[bank.fine_edges[jnp.maximum(state, 0)]]
-    return (state == convert.DRIVABLE) | ((state >= 0) & _left_of_nearest(row, point, z))
+    left = _left_of_nearest(row, point, z)
+    return (state == edge_table.DRIVABLE) | ((state >= 0) & left)
 
 
 def _left_of_nearest(
     edges: Float[Array, "candidates 10"], point: Float[Array, "2"], z: Float[Array, ""]
 ) -> Bool[Array, ""]:
-    dx, dy, dz = edges[:, 3], edges[:, 4], edges[:, 5] * tables.HEIGHT_WEIGHT
+    dx, dy, dz = edges[:, 3], edges[:, 4], edges[:, 5] * edge_table.HEIGHT_WEIGHT
     x, y = point[0] - edges[:, 0], point[1] - edges[:, 1]
-    h = (z - edges[:, 2]) * tables.HEIGHT_WEIGHT
+    h = (z - edges[:, 2]) * edge_table.HEIGHT_WEIGHT
     squared = jnp.maximum(dx * dx + dy * dy + dz * dz, 1e-12)
     t = jnp.clip((x * dx + y * dy + h * dz) / squared, 0.0, 1.0)
     distance = (x - t * dx) ** 2 + (y - t * dy) ** 2 + (h - t * dz) ** 2
@@ -192,4 +196,6 @@ def progress(
     """(s_now - s_start) / (s_end - s_start) on the logged route; NaN below 1 m."""
     start, end = bank.route_start[scene, index], bank.route_end[scene, index]
     moved = end - start >= 1.0
-    return jnp.where(moved, (along - start) / jnp.where(moved, end - start, 1.0), jnp.nan)
+    return jnp.where(
+        moved, (along - start) / jnp.where(moved, end - start, 1.0), jnp.nan
+    )

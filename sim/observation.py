@@ -171,7 +171,7 @@ def observe(
     )
 
 
-def _ego(  # noqa: PLR0913 - the parts of one observation
+def _ego(
     bank: Bank,
     scene: Int[Array, ""],
     step: Int[Array, ""],
@@ -322,7 +322,7 @@ def _nearest(
 def cell_of(
     bank: Bank, scene: Int[Array, ""], x: Float[Array, ""], y: Float[Array, ""]
 ) -> Int[Array, ""]:
-    """The row of `bank.cell_rows` for a point; outside the grid, the nearest cell's."""
+    """The number of a point's cell; outside the grid, the nearest cell's."""
     shape = bank.grid_shape[scene]
     point = jnp.stack([x, y])
     cell = ((point - bank.grid_origin[scene]) / tables.CELL).astype(jnp.int32)
@@ -335,8 +335,11 @@ def _road(
 ) -> tuple[Float[Array, "rows road"], Bool[Array, " rows"]]:
     cell = cell_of(bank, scene, frame.x, frame.y)
     rows = config.road_rows
-    near = bank.cell_rows[cell, :rows].astype(jnp.int32) + bank.segment_start[scene]
-    valid = jnp.arange(rows) < bank.cell_count[cell].astype(jnp.int32)
+    row = bank.cell_row[cell]
+    near = bank.rows[jnp.maximum(row, 0), :rows].astype(jnp.int32)
+    near = near + bank.segment_start[scene]
+    valid = jnp.arange(rows) < bank.row_count[jnp.maximum(row, 0)].astype(jnp.int32)
+    valid = valid & (row >= 0)
     segment = bank.segments[near]
     x0, y0 = frame.place(segment[:, 0], segment[:, 1])
     x1, y1 = frame.place(segment[:, 2], segment[:, 3])
