@@ -135,10 +135,12 @@ class Sampler:
     def update_priorities(
         self,
         ids: Integer[np.ndarray, " updates"],
-        priorities: Float[np.ndarray, " updates"],
+        priorities: Float[np.ndarray, " priorities"],
     ) -> None:
         """New priorities, |TD error|; they ride in the next sample query."""
         new = np.asarray(priorities, np.float64)
+        if len(ids) != len(new):
+            raise ReplayError(f"{len(ids)} ids but {len(new)} priorities")
         if not (np.isfinite(new).all() and (new >= 0).all()):
             raise ReplayError(
                 "priorities must be finite and >= 0; NaN or infinity here means that "

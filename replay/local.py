@@ -142,7 +142,7 @@ class LocalReplay:
     def update_priorities(
         self,
         ids: Integer[np.ndarray, " updates"],
-        priorities: Float[np.ndarray, " updates"],
+        priorities: Float[np.ndarray, " priorities"],
     ) -> None:
         """Sets priorities, |TD error|; rows that are gone are skipped and counted."""
         self.stale_updates += self.table.update_priorities(

@@ -233,7 +233,7 @@ class Table:
     def update_priorities(
         self,
         ids: Integer[np.ndarray, " updates"],
-        priorities: Float[np.ndarray, " updates"],
+        priorities: Float[np.ndarray, " priorities"],
     ) -> int:
         """Sets priorities; returns how many ids were gone (or never given out).
 

@@ -1,0 +1,130 @@
+"""The limiter against its definition, and against deadlock."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from replay.limiter import LimiterError, RateLimiter
+from replay.local import ReplayConfig
+from replay.spec import ReplayError
+
+counts = st.integers(0, 400)
+
+
+def allowed_slowly(limiter: RateLimiter, n: int, i: int, d: int, s: int) -> list[bool]:
+    """Oracle: the two rules as the design states them (inserts, samples)."""
+    spi, m, e = limiter.samples_per_insert, limiter.min_size, limiter.tolerance
+    insert = i + n - d <= m or (i + n) * spi - s <= m * spi + e
+    sample = i - d >= m and i * spi - s - n >= m * spi - e
+    return [insert, sample]
+
+
+@given(
+    spi=st.sampled_from([0.25, 0.5, 1.0, 2.0, 8.0]),
+    m=st.integers(1, 100),
+    e=st.integers(0, 300),
+    n=st.integers(1, 64),
+    inserts=counts,
+    deletes=counts,
+    samples=counts,
+)
+def test_limiter_agrees_with_the_definition(
+    spi: float, m: int, e: int, n: int, inserts: int, deletes: int, samples: int
+) -> None:
+    limiter = RateLimiter(samples_per_insert=spi, min_size=m, tolerance=e)
+    now = {"inserts": inserts, "deletes": min(deletes, inserts), "samples": samples}
+    got = [limiter.may_insert(n, **now), limiter.may_sample(n, **now)]
+    assert got == allowed_slowly(limiter, n, inserts, min(deletes, inserts), samples)
+
+
+@given(
+    spi=st.sampled_from([0.25, 0.5, 1.0, 3.0, 8.0]),
+    m=st.integers(1, 60),
+    e=st.floats(0, 300),
+    insert_rows=st.integers(1, 24),
+    sample_rows=st.integers(1, 48),
+    spare=st.integers(0, 40),
+    data=st.data(),
+)
+def test_accepted_settings_never_block_both_sides(
+    spi: float,
+    m: int,
+    e: float,
+    insert_rows: int,
+    sample_rows: int,
+    spare: int,
+    data: st.DataObject,
+) -> None:
+    """Any order of batches of any size up to the declared ones goes on for ever."""
+    limiter = RateLimiter(samples_per_insert=spi, min_size=m, tolerance=e)
+    try:
+        limiter.check_batches(insert_rows=insert_rows, sample_rows=sample_rows)
+    except LimiterError:
+        return
+    capacity = max(m, insert_rows) + spare
+    inserts = samples = 0
+    for _ in range(60):
+        now = {
+            "inserts": inserts,
+            "deletes": max(0, inserts - capacity),
+            "samples": samples,
+        }
+        a = data.draw(st.integers(1, insert_rows))
+        b = data.draw(st.integers(1, sample_rows))
+        may_insert, may_sample = (
+            limiter.may_insert(a, **now),
+            limiter.may_sample(b, **now),
+        )
+        assert may_insert or may_sample, (now, a, b)
+        if may_insert and (not may_sample or data.draw(st.booleans())):
+            inserts += a
+        else:
+            samples += b
+
+
+@pytest.mark.parametrize(
+    ("m", "e", "insert_rows", "sample_rows", "why"),
+    [(100, 7.0, 4, 8, "once filled"), (7, 16.0, 10, 1, "while filling")],
+)
+def test_refused_settings_do_deadlock(
+    m: int, e: float, insert_rows: int, sample_rows: int, why: str
+) -> None:
+    """The refusal is right: some order of batches leaves both sides waiting."""
+    limiter = RateLimiter(samples_per_insert=2.0, min_size=m, tolerance=e)
+    with pytest.raises(LimiterError, match=f"would deadlock.*{why}"):
+        limiter.check_batches(insert_rows=insert_rows, sample_rows=sample_rows)
+    stuck = [
+        (inserts, samples)
+        for inserts in range(2 * m + 20)
+        for samples in range(0, 4 * m + 40)
+        if (inserts >= m or samples == 0)
+        and not limiter.may_insert(
+            insert_rows, inserts=inserts, deletes=0, samples=samples
+        )
+        and not limiter.may_sample(
+            sample_rows, inserts=inserts, deletes=0, samples=samples
+        )
+    ]
+    assert stuck
+
+
+def test_the_papers_settings_are_accepted() -> None:
+    limiter = ReplayConfig().limiter()
+    assert limiter.tolerance == pytest.approx(800.0)
+    limiter.check_batches(insert_rows=64, sample_rows=64)
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"samples_per_insert": 0.0}, "must be finite and > 0"),
+        ({"samples_per_insert": float("inf")}, "must be finite and > 0"),
+        ({"min_size": 0}, "at least 1"),
+        ({"tolerance": -0.1}, "tolerance"),
+        ({"tolerance": float("nan")}, "tolerance"),
+        ({"capacity": 999}, "wait for ever"),
+    ],
+)
+def test_meaningless_settings_are_refused(settings: dict[str, float], why: str) -> None:
+    with pytest.raises(ReplayError, match=why):
+        ReplayConfig(**settings)
