@@ -85,7 +85,7 @@ def layout(
     drives = [_drive(root, root.replace("_", " ").strip("/")) for root in roots]
     views = drives[0] if len(drives) == 1 else rrb.Grid(*drives)
     return rrb.Blueprint(
-        rrb.Horizontal(views, _panel(roots[0]), column_shares=[1.7, 1]),
+        rrb.Horizontal(views, _panel(roots[0]), column_shares=[1.6, 1]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(

@@ -6,12 +6,14 @@ before they are served: a browser shows a broken file as an empty page.
 """
 
 import json
+import socket
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from launch.viewer import ViewerConfig
 from launch.web import FileServer, ViewError, WebConfig, WebViewer
 
 RECORDING: Final = "evaluation.rrd"
@@ -93,3 +95,42 @@ def serve_recording(
         announce(web.url)
         while not stop.wait(1.0):
             web.check()
+
+
+def is_up(endpoint: str) -> bool:
+    """Whether someone listens at a Zenoh endpoint, `tcp/HOST:PORT`."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=2.0).close()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def view(
+    target: Path,
+    config: ViewerConfig,
+    *,
+    stop: threading.Event,
+    announce: Callable[[str], None],
+) -> None:
+    """Shows a recording or a run until `stop`.
+
+    A run that was killed leaves its `endpoint.json` behind; where nobody listens any
+    more, its recording is what there is to see.
+    """
+    endpoint = Endpoint.read(target) if target.is_dir() else None
+    if endpoint is not None and any(is_up(place) for place in endpoint.connect):
+        from launch.join import JoinConfig
+        from launch.roles import viewer_role
+
+        join = JoinConfig(
+            run_id=endpoint.run_id,
+            connect=endpoint.connect,
+            insecure=config.web.insecure,
+            run=target,
+        )
+        viewer_role(join, config, stop)
+        return
+    path = recording_of(target)
+    serve_recording(path, config.web, stop=stop, announce=announce)

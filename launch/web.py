@@ -121,7 +121,9 @@ class WebViewer:
         """Where to log to."""
         shown = source or f"rerun+http://{address}/proxy"
         page = f"http://{_reachable(config.host)}:{config.web_port}"
-        self.url = f"{page}/?url={quote(shown, safe='')}"
+        # Nothing persists: a layout that a browser remembers would hide the run's own.
+        options = "theme=dark&hide_welcome_screen=1&persist=0"
+        self.url = f"{page}/?url={quote(shown, safe='')}&{options}"
         """What to open in a browser."""
         self._command = [
             str(_program()),

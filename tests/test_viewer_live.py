@@ -18,7 +18,8 @@ from rerun.chunk import RrdReader
 from actors.frames import FrameBatch, encode_frames, make_frames
 from launch.recording import record_evaluation
 from launch.scene_view import ViewScene
-from launch.view import Endpoint, recording_of, serve_recording
+from launch.view import Endpoint, is_up, recording_of
+from launch.view import view as view_target
 from launch.viewer import LiveView, Playlist, Viewer, ViewerConfig, play
 from launch.web import FileServer, ViewError, WebConfig, WebViewer
 from replay.channels import FramePublisher, FrameSubscriber
@@ -356,14 +357,23 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_recording_is_served_to_the_page_alone(recording: Path) -> None:
+def test_the_recording_of_a_run_that_ended_is_served_to_the_page_alone(
+    recording: Path,
+) -> None:
     config = web_config()
+    (ended,) = free_ports(1)
+    Endpoint("ended", (f"tcp/127.0.0.1:{ended}",)).write(recording.parent)
     stop, urls = threading.Event(), []
     failures: list[BaseException] = []
 
     def serve() -> None:
         try:
-            serve_recording(recording, config, stop=stop, announce=urls.append)
+            view_target(
+                recording.parent,
+                ViewerConfig(web=config),
+                stop=stop,
+                announce=urls.append,
+            )
         except BaseException as error:
             failures.append(error)
 
@@ -411,3 +421,11 @@ def test_the_endpoint_of_a_run(tmp_path: Path) -> None:
         (tmp_path / "endpoint.json").write_text(content)
         with pytest.raises(ViewError, match="delete it"):
             Endpoint.read(tmp_path)
+
+
+def test_whether_an_endpoint_answers() -> None:
+    (port,) = free_ports(1)
+    assert not is_up(f"tcp/127.0.0.1:{port}")
+    with socket.create_server(("127.0.0.1", port)):
+        assert is_up(f"tcp/127.0.0.1:{port}")
+    assert not is_up("nonsense")
