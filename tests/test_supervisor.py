@@ -111,6 +111,7 @@ def test_a_critical_role_ends_the_run(tmp_path: Path) -> None:
     )
     assert result.outcome is Outcome.FAILED
     assert result.reason.startswith("replay ended with exit code 3: the table is gone")
+    assert (tmp_path / "replay.log").read_text() == "the table is gone\n"  # once
 
 
 def test_a_users_mistake_is_not_repeated(tmp_path: Path) -> None:

@@ -1,0 +1,218 @@
+"""The configuration of a run: the components' configurations, budget and scenes.
+
+One frozen dataclass is the command line, `config.json` of the run folder and what the
+processes of a run share. Two presets:
+
+    quick   learns to drive on two cores in minutes: a small network, few road rows, a
+            progress reward (the paper's reward is satisfied by standing still), a
+            higher learning rate
+    paper   appendix A.2 of the Waymax paper, else Acme's (`paper.md` of the issue
+            tracker's design; the components' defaults)
+
+`RunFile` is what is written: the configuration with the run's id and the banks'
+hashes, so that a process that joins can tell whether it has the same scenes.
+"""
+
+import dataclasses
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from actors.actor import ActorConfig
+from actors.network import NetworkConfig
+from launch.errors import LaunchError
+from learner.config import LearnerConfig
+from replay.local import ReplayConfig
+from sim.environment import EnvironmentConfig
+from sim.observation import ObservationConfig
+
+CONFIG: Final = "config.json"
+FORMAT: Final = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class BudgetConfig:
+    """When a run is over; whichever comes first."""
+
+    updates: int = 3_750_000
+    """Updates of the learner (the paper's 30 million steps at ratio 8, batch 64)."""
+    minutes: float = 0.0
+    """Minutes since the first update, over all restarts; 0 is no limit."""
+
+    def __post_init__(self) -> None:
+        """Refuses a run that is over before it begins."""
+        if self.updates < 1 or self.minutes < 0:
+            raise ValueError(
+                f"budget: updates={self.updates} must be at least 1 and minutes="
+                f"{self.minutes} not negative"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenesConfig:
+    """Scenes made by the procedural generator."""
+
+    train: int = 256
+    """Scenes to train on."""
+    held_out: int = 64
+    """Scenes to evaluate on, of another seed."""
+    seed: int = 0
+    """Of the generator."""
+    held_out_share: float = 0.2
+    """Of recorded scenes, this share is held out, at least one if there are two."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportConfig:
+    """What a run writes down, and how often."""
+
+    checkpoint_s: float = 30.0
+    """Seconds between two checkpoints."""
+    checkpoints: int = 3
+    """Newest checkpoints kept."""
+    curves_s: float = 2.0
+    """Seconds between two rows of the curves."""
+    tensorboard: bool = True
+    """Write TensorBoard events beside the CSV file."""
+    rollouts: int = 12
+    """Evaluation rollouts recorded for the viewer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentConfig:
+    """Everything that a run depends on."""
+
+    environment: EnvironmentConfig = field(default_factory=EnvironmentConfig)
+    """Actions, observation, reward, termination."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """The policy's network."""
+    actor: ActorConfig = field(default_factory=lambda: ActorConfig(environments=8))
+    """One actor process."""
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
+    """The replay service."""
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    """The updates."""
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    """When the run is over."""
+    scenes: ScenesConfig = field(default_factory=ScenesConfig)
+    """Procedural scenes, and how recorded ones are split."""
+    report: ReportConfig = field(default_factory=ReportConfig)
+    """Checkpoints, curves, recording."""
+    actors: int = 2
+    """Actor processes."""
+    seed: int = 0
+    """Of everything random but the scenes: weights, exploration, draws."""
+
+    def __post_init__(self) -> None:
+        """Refuses a run without actors, and one whose two sides wait for each other."""
+        if self.actors < 1:
+            raise ValueError(f"actors={self.actors} must be at least 1")
+        self.replay.limiter().check_batches(
+            insert_rows=self.actor.environments * self.actor.scan_steps,
+            sample_rows=self.learner.batch_size,
+        )
+
+
+def quick() -> ExperimentConfig:
+    """A run of minutes on two cores."""
+    return ExperimentConfig(
+        environment=EnvironmentConfig(
+            observation=ObservationConfig(neighbours=8, road_rows=32),
+            progress=0.1,
+            terminate=True,
+        ),
+        network=NetworkConfig(
+            width=32, heads=2, latents=4, cross_layers=1, self_layers=1
+        ),
+        actor=ActorConfig(environments=16, scan_steps=8),
+        replay=ReplayConfig(capacity=200_000, min_size=2_000),
+        learner=LearnerConfig(learning_rate=5e-4, loss="plain", discount=0.95),
+        budget=BudgetConfig(updates=20_000, minutes=4.5),
+    )
+
+
+def paper() -> ExperimentConfig:
+    """The paper's DQN."""
+    return ExperimentConfig()
+
+
+PRESETS: Final = {"quick": quick, "paper": paper}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFile:
+    """`config.json`: what the processes of a run share."""
+
+    run_id: str
+    config: ExperimentConfig
+    train_hash: str  # of the bank's content, SHA-256
+    held_out_hash: str
+    scenes: tuple[str, ...]  # as given on the command line
+    format: int = FORMAT
+
+    def write(self, folder: Path) -> None:
+        """Writes the run folder's file; whole or not at all."""
+        data = msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
+        write_atomically(folder / CONFIG, data)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Replaces a file by a rename: a reader sees the old content or the new."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_bytes(data)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_run(path: Path) -> RunFile:
+    """Reads a run folder's configuration, or the file itself."""
+    file = path / CONFIG if path.is_dir() else path
+    try:
+        data = file.read_bytes()
+    except FileNotFoundError:
+        raise LaunchError(f"{path}: no run here ({CONFIG} is missing)") from None
+    return decode_run(data, where=str(file))
+
+
+def decode_run(data: bytes, *, where: str) -> RunFile:
+    """Parses and checks a run's configuration, from a file or the network."""
+    try:
+        content = msgspec.json.decode(data)
+        run = msgspec.convert(content, RunFile)
+    except (msgspec.DecodeError, ValueError) as error:
+        raise LaunchError(
+            f"{where}: not a run's configuration ({error}); use a run made by this "
+            "version"
+        ) from error
+    # What is unknown was meant to say something: it is not passed over.
+    unknown = _unknown(content, json.loads(msgspec.json.encode(run)), "")
+    if unknown or run.format != FORMAT:
+        raise LaunchError(
+            f"{where}: format {run.format}, this version reads {FORMAT}"
+            + (f"; unknown {unknown[0]}" if unknown else "")
+            + "; use the version that wrote it"
+        )
+    return run
+
+
+def _unknown(content: Any, known: Any, at: str) -> list[str]:  # noqa: ANN401 - JSON
+    """Keys of `content` that `known` has not, as dotted paths."""
+    if not (isinstance(content, dict) and isinstance(known, dict)):
+        return []
+    found = [f"{at}{name}" for name in content if name not in known]
+    for name in content.keys() & known.keys():
+        found += _unknown(content[name], known[name], f"{at}{name}.")
+    return found
+
+
+def with_environments(config: ExperimentConfig, count: int) -> ExperimentConfig:
+    """The same run with another number of environments per actor."""
+    watched = min(config.actor.watched, count)
+    actor = dataclasses.replace(config.actor, environments=count, watched=watched)
+    return dataclasses.replace(config, actor=actor)

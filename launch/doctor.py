@@ -1,0 +1,255 @@
+"""`slipstream doctor`: what works on this machine, and what to do about what does not.
+
+Each check is tried and not guessed: the Zenoh ones make a round trip over loopback,
+with and without shared memory. Exit code 0 when a run can be made here.
+"""
+
+import importlib.metadata
+import json
+import os
+import shutil
+import socket
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+Verdict = Literal["ok", "warning", "error"]
+PACKAGES: Final = {
+    "numpy": "base",
+    "jax": "base",
+    "jaxlib": "base",
+    "msgspec": "base",
+    "eclipse-zenoh": "base",
+    "torch": "learner",
+    "torchrl": "learner",
+    "tensorboard": "learner",
+    "matplotlib": "learner",
+    "rerun-sdk": "viewer",
+}
+_PAYLOAD: Final = 1 << 20  # bytes, large enough to go by shared memory
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one check found, and what to do."""
+
+    check: str
+    verdict: Verdict
+    found: str
+    advice: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorConfig:
+    """Says what works on this machine."""
+
+    json: bool = False
+    """Prints JSON and no table."""
+
+
+def python_version() -> Finding:
+    """Which Python this is; an older one than 3.11 is refused at installation."""
+    found = ".".join(map(str, sys.version_info[:3]))
+    return Finding("python", "ok", f"{found}, {sys.executable}")
+
+
+def packages() -> Finding:
+    """What the roles need."""
+    found, missing = [], {}
+    for name, extra in PACKAGES.items():
+        try:
+            found.append(f"{name} {importlib.metadata.version(name)}")
+        except importlib.metadata.PackageNotFoundError:
+            missing[name] = extra
+    if not missing:
+        return Finding("packages", "ok", ", ".join(found))
+    verdict: Verdict = "error" if "base" in missing.values() else "warning"
+    extras = ",".join(sorted(set(missing.values()) - {"base"}))
+    advice = (
+        f"pip install 'slipstream[{extras}]'" if extras else "pip install slipstream"
+    )
+    return Finding("packages", verdict, f"missing: {', '.join(missing)}", advice)
+
+
+def cores() -> Finding:
+    """Processors that this process may use."""
+    count = len(os.sched_getaffinity(0))
+    if count < 2:
+        return Finding(
+            "cores", "warning", str(count), "actors and learner share it: expect half"
+        )
+    return Finding("cores", "ok", str(count))
+
+
+def memory() -> Finding:
+    """Memory that is free; a quick run takes about 3 GB."""
+    free = psutil.virtual_memory().available / 1e9
+    if free < 4:
+        return Finding(
+            "memory",
+            "warning",
+            f"{free:.1f} GB free",
+            "use fewer --actors, or --serial",
+        )
+    return Finding("memory", "ok", f"{free:.1f} GB free")
+
+
+def shared_memory_size() -> Finding:
+    """/dev/shm, which Zenoh's shared memory comes from."""
+    path = Path("/dev/shm")
+    if not path.is_dir():
+        return Finding(
+            "/dev/shm", "warning", "missing", "messages go by TCP, which is slower"
+        )
+    free = shutil.disk_usage(path).free / 1e6
+    if free < 256:
+        advice = "give the container more, e.g. docker run --shm-size=1g"
+        return Finding("/dev/shm", "warning", f"{free:.0f} MB free", advice)
+    return Finding("/dev/shm", "ok", f"{free:,.0f} MB free")
+
+
+def disk() -> Finding:
+    """Room for runs where this was started, and permission to write there."""
+    folder = Path.cwd()
+    free = shutil.disk_usage(folder).free / 1e9
+    if not os.access(folder, os.W_OK):
+        advice = "start it in a folder of yours, or give --run"
+        return Finding("disk", "error", f"{folder} cannot be written", advice)
+    if free < 2:
+        return Finding("disk", "warning", f"{free:.1f} GB free", "free some space")
+    return Finding("disk", "ok", f"{free:.1f} GB free in {folder}")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def ports() -> Finding:
+    """A free port of loopback, and the viewer's usual ones."""
+    taken = []
+    for port in (9090, 9876):
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                taken.append(str(port))
+    if taken:
+        advice = "give the viewer others: --web-port, --data-port"
+        return Finding("ports", "warning", f"in use: {', '.join(taken)}", advice)
+    return Finding("ports", "ok", f"{_free_port()} is free, so are 9090 and 9876")
+
+
+def zenoh_loopback(shared_memory: bool) -> Finding:
+    """A file of 1 MB asked for and answered between two sessions."""
+    from replay.channels import ControlSubscriber, send_stop
+    from replay.keys import RunKeys
+    from replay.session import open_session
+
+    name = "zenoh, shared memory" if shared_memory else "zenoh, tcp"
+    endpoint, keys = f"tcp/127.0.0.1:{_free_port()}", RunKeys("doctor")
+    with (
+        open_session(
+            listen=[endpoint], router=True, shared_memory=shared_memory
+        ) as router,
+        open_session(connect=[endpoint], shared_memory=shared_memory) as client,
+    ):
+        listening = ControlSubscriber(router, keys)
+        began = time.perf_counter()
+        deadline = began + 5.0
+        # A subscription takes a moment to be known to the other side.
+        while not listening.stop.wait(0.01) and time.perf_counter() < deadline:
+            send_stop(client, keys, "x" * _PAYLOAD)
+        took = time.perf_counter() - began
+        arrived = listening.stop.is_set()
+    if not arrived:
+        advice = "check that loopback is up and no firewall filters it"
+        return Finding(name, "error", "no message arrived within 5 s", advice)
+    return Finding(name, "ok", f"1 MB arrived within {took * 1e3:.0f} ms")
+
+
+def jax_devices() -> Finding:
+    """Where JAX computes."""
+    import jax
+
+    devices = jax.devices()
+    return Finding("jax", "ok", ", ".join(str(device) for device in devices))
+
+
+def torch_devices() -> Finding:
+    """Where torch computes."""
+    try:
+        import torch
+    except ImportError:
+        advice = "only replay and learner need it: pip install 'slipstream[learner]'"
+        return Finding("torch", "warning", "not installed", advice)
+    count = torch.cuda.device_count()
+    names = ", ".join(torch.cuda.get_device_name(index) for index in range(count))
+    return Finding("torch", "ok", f"cpu{', ' + names if names else ''}")
+
+
+def rerun() -> Finding:
+    """The viewer's program."""
+    try:
+        import rerun_cli  # type: ignore[import-untyped]
+    except ImportError:
+        advice = "only the viewer needs it: pip install 'slipstream[viewer]'"
+        return Finding("rerun", "warning", "not installed", advice)
+    program = Path(rerun_cli.__file__).parent / "rerun"
+    if not os.access(program, os.X_OK):
+        return Finding(
+            "rerun", "warning", f"{program} cannot be run", "install rerun-sdk again"
+        )
+    return Finding("rerun", "ok", str(program))
+
+
+CHECKS: Final[tuple[tuple[str, Callable[[], Finding]], ...]] = (
+    ("python", python_version),
+    ("packages", packages),
+    ("cores", cores),
+    ("memory", memory),
+    ("/dev/shm", shared_memory_size),
+    ("disk", disk),
+    ("ports", ports),
+    ("zenoh, tcp", lambda: zenoh_loopback(False)),
+    ("zenoh, shared memory", lambda: zenoh_loopback(True)),
+    ("jax", jax_devices),
+    ("torch", torch_devices),
+    ("rerun", rerun),
+)
+
+
+def examine(name: str, check: Callable[[], Finding]) -> Finding:
+    """A check's finding; one that breaks has found something too."""
+    try:
+        return check()
+    except Exception as error:  # whatever it is, it is what the user needs to know
+        line = " ".join(str(error).split())[:200]
+        return Finding(name, "error", f"{type(error).__name__}: {line}", "see above")
+
+
+def doctor_command(options: DoctorConfig) -> int:
+    """`slipstream doctor`."""
+    findings = [examine(name, check) for name, check in CHECKS]
+    broken = any(finding.verdict == "error" for finding in findings)
+    if options.json:
+        print(json.dumps([asdict(finding) for finding in findings], indent=1))
+        return int(broken)
+    colours = {"ok": "green", "warning": "yellow", "error": "red"}
+    table = Table("check", "", "found", "what to do")
+    for finding in findings:
+        colour = colours[finding.verdict]
+        table.add_row(
+            finding.check,
+            f"[{colour}]{finding.verdict}[/{colour}]",
+            finding.found,
+            finding.advice,
+        )
+    Console().print(table)
+    return int(broken)

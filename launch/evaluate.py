@@ -1,0 +1,323 @@
+"""`slipstream evaluate`, and the comparison that a run ends with.
+
+Agents by name are the benchmark's (`sim.agents`); anything else is a run, its
+checkpoints or one of them. The results of every scene are in the JSON, and the table
+is a summary of them.
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from actors.evaluation import Evaluation, Trace, evaluate
+from actors.frames import FrameBatch, make_frames
+from actors.policy import greedy, random_vector, read_policy
+from launch.config import ExperimentConfig, ScenesConfig, quick, write_atomically
+from launch.errors import LaunchError
+from launch.scenes import bank_of
+from sim.agents import (
+    Agent,
+    ExpertSpace,
+    constant_speed,
+    expert,
+    log_playback,
+    random_actions,
+)
+from sim.bank import BankFile
+from sim.dynamics import ActionSpace
+from sim.environment import EnvironmentConfig
+
+NAMES: Final = ("log", "expert", "constant-speed", "random")
+COLUMNS: Final = (
+    ("failure_rate", "failures", "{:.1%}"),
+    ("overlap_rate", "overlap", "{:.1%}"),
+    ("offroad_rate", "off-road", "{:.1%}"),
+    ("progress", "progress", "{:.2f}"),
+    ("log_displacement", "log displacement [m]", "{:.2f}"),
+    ("kinematic_infeasibility", "infeasible", "{:.1%}"),
+)
+
+
+def summary(evaluation: Evaluation) -> dict[str, float | int | str | None]:
+    """The figures of an agent; JSON has no NaN, so what there is none of is null."""
+    figures: dict[str, float] = {
+        "failure_rate": evaluation.failure_rate,
+        "overlap_rate": evaluation.rate("overlap"),
+        "offroad_rate": evaluation.rate("offroad"),
+        "progress": evaluation.progress,
+        "log_displacement": evaluation.log_displacement,
+        "kinematic_infeasibility": evaluation.infeasible,
+    }
+    known = {k: v if np.isfinite(v) else None for k, v in figures.items()}
+    return {"agent": evaluation.agent, "scenes": len(evaluation.scenes), **known}
+
+
+def table_of(evaluations: Sequence[Evaluation], title: str) -> Table:
+    """One row per agent."""
+    table = Table(title=title)
+    table.add_column("agent")
+    for _, heading, _ in COLUMNS:
+        table.add_column(heading, justify="right")
+    for evaluation in evaluations:
+        figures = summary(evaluation)
+        cells = [
+            "-" if figures[name] is None else form.format(figures[name])
+            for name, _, form in COLUMNS
+        ]
+        table.add_row(evaluation.agent, *cells)
+    return table
+
+
+def markdown_of(evaluations: Sequence[Evaluation], title: str) -> str:
+    """The same table for a README."""
+    lines = [f"# {title}", "", "| agent | " + " | ".join(h for _, h, _ in COLUMNS)]
+    lines[-1] += " |"
+    lines.append("|" + "---|" * (len(COLUMNS) + 1))
+    for evaluation in evaluations:
+        figures = summary(evaluation)
+        cells = [
+            "-" if figures[name] is None else form.format(figures[name])
+            for name, _, form in COLUMNS
+        ]
+        lines.append(f"| {evaluation.agent} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def scenes_json(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """Every scene's row."""
+    return [dataclasses.asdict(scene) for scene in evaluation.scenes]
+
+
+def built_in(name: str, environment: EnvironmentConfig) -> Agent:
+    """An agent that needs no learning."""
+    if name == "log":
+        return log_playback()
+    if name == "expert":
+        return expert(environment, ExpertSpace(ActionSpace.BICYCLE, on_grid=False))
+    if name == "constant-speed":
+        return constant_speed(environment)
+    return random_actions(environment)
+
+
+@dataclass(frozen=True)
+class Driver:
+    """An agent with the environment that it knows."""
+
+    name: str
+    agent: Agent
+    environment: EnvironmentConfig
+
+
+def driver_of(name: str) -> Driver:
+    """What `--agent` names."""
+    if name in NAMES:
+        environment = quick().environment
+        return Driver(name, built_in(name, environment), environment)
+    path = Path(name)
+    if not path.exists():
+        raise LaunchError(
+            f"--agent {name}: unknown; one of {', '.join(NAMES)}, or the path of a run "
+            "or a checkpoint"
+        )
+    policy = read_policy(path)
+    try:
+        config = msgspec.convert(policy.extra["config"], ExperimentConfig)
+    except (KeyError, ValueError) as error:
+        raise LaunchError(
+            f"{path}: the checkpoint lacks its run's configuration ({error}); use one "
+            "that `slipstream train` wrote"
+        ) from error
+    policy.check(config.environment, path)
+    vector = jnp.array(policy.vector)
+    agent = greedy(vector, policy.network, config.environment)
+    return Driver(str(path), agent, config.environment)
+
+
+def check_step(bank: BankFile, environment: EnvironmentConfig) -> None:
+    """Refuses scenes of another step length than the agent was made for."""
+    if abs(bank.dt - environment.dt) > 1e-6:
+        raise LaunchError(
+            f"{bank.path}: steps of {bank.dt} s, the agent's are {environment.dt} s; "
+            "use scenes recorded at that rate"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateConfig:
+    """Drives scenes with an agent and judges it."""
+
+    agent: str
+    """expert, constant-speed, random, log (playback), or a run or checkpoint."""
+    scenes: tuple[str, ...] = ("procedural",)
+    """Banks, files or folders of scenes, or `procedural`."""
+    objects: Literal["sdc", "all"] = "sdc"
+    """Which objects the agent controls."""
+    json: str = ""
+    """Writes the results of every scene to this file, or to standard output by -."""
+    count: int = 64
+    """Scenes of `procedural`."""
+    seed: int = 0
+    """Of the procedural scenes and of agents that draw."""
+
+
+def evaluate_command(options: EvaluateConfig) -> int:
+    """`slipstream evaluate`."""
+    driver = driver_of(options.agent)
+    config = ScenesConfig(held_out=options.count, seed=options.seed)
+    with ExitStack() as keep:
+        bank = bank_of(options.scenes, config=config, keep=keep)
+        check_step(bank, driver.environment)
+        result = evaluate(
+            bank,
+            driver.agent,
+            name=driver.name,
+            key=jax.random.key(options.seed),
+            config=driver.environment,
+            all_objects=options.objects == "all",
+            from_first_step=driver.name == "log",
+        )
+    content = {**summary(result), "scenes": scenes_json(result)}
+    text = json.dumps(content, indent=1)
+    if options.json == "-":
+        print(text)
+        return 0
+    if options.json:
+        write_atomically(Path(options.json), (text + "\n").encode())
+    names = ", ".join(options.scenes)
+    Console().print(table_of([result], f"{names}: {bank.scenes} scenes"))
+    return 0
+
+
+def compare(
+    config: ExperimentConfig, policy_path: Path, bank: BankFile
+) -> list[Evaluation]:
+    """The trained agent beside the untrained network and the benchmark's agents."""
+    environment = config.environment
+    policy = read_policy(policy_path)
+    policy.check(environment, policy_path)
+    key = jax.random.fold_in(jax.random.key(config.seed), 1_000_000)
+    weights_key, key = jax.random.split(key)
+    untrained = random_vector(weights_key, config.network, environment)
+    drivers: list[tuple[str, Agent]] = [
+        ("trained", greedy(jnp.array(policy.vector), config.network, environment)),
+        ("untrained", greedy(untrained, config.network, environment)),
+        *((name, built_in(name, environment)) for name in reversed(NAMES[1:])),
+    ]
+    results = []
+    for name, agent in drivers:
+        key, own_key = jax.random.split(key)
+        result = evaluate(
+            bank,
+            agent,
+            name=name,
+            key=own_key,
+            config=environment,
+            keep_trace=name == "trained",
+        )
+        results.append(result)
+    return results
+
+
+def rollouts(
+    evaluation: Evaluation, bank: BankFile, *, most: int, version: int
+) -> Iterator[tuple[str, FrameBatch]]:
+    """The trained agent's rollouts as frames: failed ones first, then the others."""
+    trace = evaluation.trace
+    if trace is None:
+        return
+    order = sorted(
+        range(bank.scenes), key=lambda row: not evaluation.scenes[row].failed
+    )
+    shown = _interleaved(order, evaluation)[:most]
+    for row in shown:
+        result = evaluation.scenes[row]
+        how = "failed" if result.failed else "drove through"
+        batch = _frames(trace, bank, row, version)
+        if len(batch):
+            yield f"{evaluation.agent}, {result.id}: {how}", batch
+
+
+def _interleaved(order: Sequence[int], evaluation: Evaluation) -> list[int]:
+    """Failed and successful rollouts in turns: a recording of one kind misleads."""
+    failed = [row for row in order if evaluation.scenes[row].failed]
+    others = [row for row in order if not evaluation.scenes[row].failed]
+    mixed = []
+    for index in range(max(len(failed), len(others))):
+        mixed += others[index : index + 1] + failed[index : index + 1]
+    return mixed
+
+
+def _frames(trace: Trace, bank: BankFile, row: int, version: int) -> FrameBatch:
+    """One scene's steps, up to the recording's end."""
+    start = int(bank.arrays["current_step"][row])
+    steps = int(bank.arrays["steps"][row]) - 1 - start
+    part = jax.tree.map(lambda values: values[row][:steps], trace)
+    return FrameBatch(
+        actor=0,
+        environment=0,
+        actor_steps=0,
+        weights_version=version,
+        frames=make_frames(
+            steps,
+            scene=np.full(steps, row),
+            step=part.step,
+            controlled=np.full(steps, int(bank.arrays["sdc"][row])),
+            state=part.states[:, 0],
+            action=part.action[:, 0],
+            reward=part.reward[:, 0],
+            progress=part.progress[:, 0],
+            overlap=part.overlap[:, 0],
+            offroad=part.offroad[:, 0],
+        ),
+        q_values=part.q_values[:, 0],
+    )
+
+
+def report(
+    folder: Path, config: ExperimentConfig, bank: BankFile, policy_path: Path
+) -> list[Evaluation]:
+    """Writes a run's evaluation.json, .md and .rrd, and prints its table."""
+    results = compare(config, policy_path, bank)
+    title = f"{bank.scenes} held-out scenes"
+    content = {
+        "agents": [summary(result) for result in results],
+        "scenes": {result.agent: scenes_json(result) for result in results},
+    }
+    text = json.dumps(content, indent=1) + "\n"
+    write_atomically(folder / "evaluation.json", text.encode())
+    markdown = markdown_of(results, title)
+    write_atomically(folder / "evaluation.md", markdown.encode())
+    sys.stdout.flush()
+    Console().print(table_of(results, title))
+    return results
+
+
+def record(
+    folder: Path, config: ExperimentConfig, bank: BankFile, trained: Evaluation
+) -> Path | None:
+    """Writes the recording of the trained agent; None where Rerun is not installed."""
+    try:
+        from launch.bank_view import bank_scenes, labels_of
+        from launch.recording import record_evaluation
+    except ImportError:
+        return None
+    path = folder / "evaluation.rrd"
+    record_evaluation(
+        path,
+        scene_of=bank_scenes(bank),
+        rollouts=rollouts(trained, bank, most=config.report.rollouts, version=0),
+        actions=labels_of(config.environment.action),
+    )
+    return path

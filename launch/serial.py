@@ -1,0 +1,123 @@
+"""The whole system in one process: actors, replay and learner take turns.
+
+Same seed, same losses: the rate limiter decides who is next, from the counters alone,
+so no clock has a say (but for the budget's minutes, which should be 0 where runs are
+to be compared). Rows, table, limiter, update and rendering are those of the processes;
+only the network between them is left out.
+"""
+
+import itertools
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from actors.actor import Tick, Weights, run_actor
+from actors.network import layout_hash
+from actors.rows import row_spec
+from launch.config import ExperimentConfig, RunFile
+from launch.console import Status, line_of, snapshot
+from launch.join import SCENES, TRAIN
+from launch.learning import Progress, Reporter, make_learner, make_render, resume, spent
+from launch.roles import ActorStatus, acting_config
+from learner.learner import Learner, LearnStep, learn
+from replay.local import LocalReplay
+from replay.spec import Sample
+from replay.wire import Weights as WireWeights
+from sim.bank import Bank, open_bank
+
+_LINE_S = 10.0
+
+
+def serial_steps(
+    config: ExperimentConfig, bank: Bank, learner: Learner, status: ActorStatus
+) -> Iterator[tuple[LearnStep, LocalReplay]]:
+    """Updates for ever, actors taking their turns in between."""
+    replay = LocalReplay(
+        spec=row_spec(config.environment.observation.history),
+        config=config.replay,
+        seed=config.seed,
+    )
+    weights: list[Weights] = []
+    layout = layout_hash(learner.layout)
+    turns: list[Iterator[Tick]] = []
+
+    def publish(version: int, vector: np.ndarray) -> None:
+        weights[:] = [WireWeights(version=version, layout_hash=layout, vector=vector)]
+
+    def sample() -> Sample:
+        while not replay.may_sample(config.learner.batch_size):
+            # The limiter's check of batch sizes: one of the two sides may go on.
+            status.add(next(next(order)))
+        return replay.sample(config.learner.batch_size)
+
+    turns += _actors(config, bank, replay, weights)
+    order = itertools.cycle(turns)
+    steps = learn(
+        learner=learner,
+        sample=sample,
+        update_priorities=replay.update_priorities,
+        render=make_render(bank, config),
+        publish=publish,
+    )
+    for step in steps:
+        if step is not None:
+            yield step, replay
+
+
+def _actors(
+    config: ExperimentConfig, bank: Bank, replay: LocalReplay, weights: list[Weights]
+) -> list[Iterator[Tick]]:
+    """The acting loops; a turn of one inserts the rows of a scan."""
+    key = jax.random.key(config.seed)
+    return [
+        run_actor(
+            key=jax.random.fold_in(key, actor),
+            bank=bank,
+            config=config.actor,
+            acting_config=acting_config(config),
+            actor=actor,
+            actors=config.actors,
+            latest=lambda: weights[0],
+            write=replay.insert,
+        )
+        for actor in range(config.actors)
+    ]
+
+
+def run_serial(folder: Path, run: RunFile) -> None:
+    """Trains in this process until the budget is spent."""
+    config = run.config
+    learner = make_learner(config)
+    progress = Progress(resume(learner, folder))
+    status = ActorStatus.begin()
+    told: dict[str, float | int | str] = {}
+    counters: dict[str, float] = {}
+    reporter = Reporter(
+        learner=learner,
+        config=config,
+        folder=folder,
+        progress=progress,
+        tell=told.update,
+        outside=lambda: status.rates() | counters,
+    )
+    bank = open_bank(folder / SCENES / TRAIN).bank
+    due = time.monotonic() + _LINE_S
+    for step, replay in serial_steps(config, bank, learner, status):
+        progress.add(step)
+        counters["inserts"] = replay.inserts
+        counters["samples_per_insert"] = replay.samples_per_insert
+        reporter.look()
+        if time.monotonic() >= due:
+            due = time.monotonic() + _LINE_S
+            now = time.monotonic()
+            roles: dict[str, tuple[float, Status]] = {
+                "learner": (now, told),
+                "actor-0": (now, status.rates()),
+            }
+            print(line_of(snapshot(config, roles, counters, now)), flush=True)
+        if spent(config, learner.updates, progress.elapsed_s):
+            break
+    reporter.close()

@@ -1,0 +1,261 @@
+"""`slipstream train dqn`: from scenes to an agent, its scores and a recording.
+
+    RUN/config.json          the resolved configuration      scenes/*.bank
+        logs/ROLE.log        what each process printed       curves.csv, .png
+        tensorboard/         the same curves                 checkpoints/
+        evaluation.json .md .rrd   scores and a recording    status.json
+
+One replay service (critical), a learner that ends the run and is started again from
+its newest checkpoint, and actors that are started again are processes of their own,
+connected over Zenoh on loopback. With `serial` they take turns in this process.
+"""
+
+import asyncio
+import contextlib
+import dataclasses
+import socket
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import tyro
+from rich.console import Console
+
+from launch.config import (
+    CONFIG,
+    ExperimentConfig,
+    RunFile,
+    quick,
+    read_run,
+    with_environments,
+)
+from launch.errors import LaunchError
+from launch.join import HELD_OUT, SCENES, TRAIN, check_bank
+from launch.scenes import PROCEDURAL, prepare_banks, say
+from launch.supervisor import Outcome, Result, Role, Supervisor
+from sim.bank import open_bank
+
+LOGS: Final = "logs"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Trains double DQN with actors, replay and learner on this machine."""
+
+    preset: Literal["quick", "paper"] = "quick"
+    """The settings that all others start from."""
+    scenes: tuple[str, ...] = (PROCEDURAL,)
+    """Files or folders of recorded scenes, one or two banks, or `procedural`."""
+    run: Path | None = None
+    """The run's folder; runs/dqn-PRESET-TIME unless given."""
+    resume: bool = False
+    """Goes on with an existing run, from its newest checkpoint."""
+    envs: int | None = None
+    """Environments per actor; the same as --actor.environments."""
+    serial: bool = False
+    """Runs all roles in this process, in a fixed order: same seed, same losses."""
+    view: bool = False
+    """Shows the run live in the browser."""
+    config: Annotated[ExperimentConfig, tyro.conf.arg(name="")] = field(
+        default_factory=quick
+    )
+    """Everything else."""
+
+
+def folder_of(options: TrainConfig) -> Path:
+    """Where the run is written."""
+    if options.run is not None:
+        return options.run
+    return Path("runs") / f"dqn-{options.preset}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def resolved(options: TrainConfig) -> ExperimentConfig:
+    """The configuration with the command's short options in it."""
+    if options.envs is None:
+        return options.config
+    return with_environments(options.config, options.envs)
+
+
+def prepare(options: TrainConfig) -> tuple[Path, RunFile]:
+    """Makes the run folder with scenes and configuration, or takes up an old one."""
+    folder = folder_of(options)
+    if (folder / CONFIG).exists():
+        if not options.resume:
+            raise LaunchError(
+                f"{folder}: this run exists; go on with it by --resume, or choose "
+                "another folder"
+            )
+        return folder, _taken_up(folder, options)
+    if options.resume:
+        raise LaunchError(f"{folder}: no run to resume ({CONFIG} is missing)")
+    if folder.exists() and any(folder.iterdir()):
+        raise LaunchError(
+            f"{folder}: this folder exists and is not empty; choose another"
+        )
+    config = resolved(options)
+    (folder / SCENES).mkdir(parents=True, exist_ok=True)
+    train, held_out = prepare_banks(
+        folder / SCENES / TRAIN,
+        folder / SCENES / HELD_OUT,
+        sources=options.scenes,
+        config=config.scenes,
+    )
+    if abs(train.dt - config.environment.dt) > 1e-6:
+        raise LaunchError(
+            f"{options.scenes[0]}: recorded in steps of {train.dt} s, the environment "
+            f"has {config.environment.dt}; set --environment.dt"
+        )
+    run = RunFile(
+        run_id=f"run-{uuid.uuid4().hex[:12]}",
+        config=config,
+        train_hash=train.content_hash,
+        held_out_hash=held_out.content_hash,
+        scenes=options.scenes,
+    )
+    run.write(folder)
+    return folder, run
+
+
+def _taken_up(folder: Path, options: TrainConfig) -> RunFile:
+    """An existing run, with the settings given now, which may lengthen its budget."""
+    run = read_run(folder)
+    for name, expected in ((TRAIN, run.train_hash), (HELD_OUT, run.held_out_hash)):
+        check_bank(open_bank(folder / SCENES / name), expected)
+    run = dataclasses.replace(run, config=resolved(options))
+    run.write(folder)
+    return run
+
+
+def free_port() -> int:
+    """A port of loopback that nothing listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def roles_of(folder: Path, run: RunFile, port: int, *, view: bool) -> list[Role]:
+    """The processes of a run."""
+    endpoint = f"tcp/127.0.0.1:{port}"
+    command = (sys.executable, "-m", "launch")
+    common = ("--run-id", run.run_id, "--run", str(folder))
+    client = (*common, "--connect", endpoint)
+    roles = [
+        Role(
+            name="replay",
+            command=(*command, "replay", *common, "--listen", endpoint),
+            critical=True,
+            port=port,
+        ),
+        Role(
+            name="learner",
+            command=(*command, "learner", *client),
+            finishes=True,
+        ),
+    ]
+    for actor in range(run.config.actors):
+        roles.append(
+            Role(
+                name=f"actor-{actor}",
+                command=(*command, "actor", *client, "--actor", str(actor)),
+            )
+        )
+    if view:
+        roles.append(Role(name="viewer", command=(*command, "viewer", *client)))
+    return roles
+
+
+@contextlib.contextmanager
+def announced(folder: Path, run: RunFile, endpoint: str) -> Iterator[None]:
+    """While the run is in progress, its folder says where it can be joined."""
+    try:
+        from launch.view import ENDPOINT, Endpoint
+    except ImportError:  # without the viewer's packages nobody reads it here
+        yield
+        return
+    Endpoint(run.run_id, (endpoint,)).write(folder)
+    try:
+        yield
+    finally:
+        (folder / ENDPOINT).unlink(missing_ok=True)
+
+
+async def supervise(
+    folder: Path,
+    run: RunFile,
+    *,
+    view: bool = False,
+    on_look: Callable[[Mapping[str, Any]], None] = lambda figures: None,
+) -> Result:
+    """Runs the processes of a run to its end, with the console beside them.
+
+    `on_look` gets the console's figures about once a second.
+    """
+    from launch.console import RunConsole
+    from replay.keys import RunKeys
+
+    port = free_port()
+    endpoint = f"tcp/127.0.0.1:{port}"
+    console = Console()
+    supervisor = Supervisor(
+        roles=roles_of(folder, run, port, view=view),
+        log_folder=folder / LOGS,
+        on_event=lambda line: console.print(line, highlight=False),
+    )
+    shown = RunConsole(
+        config=run.config,
+        keys=RunKeys(run.run_id),
+        endpoint=endpoint,
+        folder=folder,
+        supervisor=supervisor,
+        console=console,
+        on_look=on_look,
+    )
+    with announced(folder, run, endpoint):
+        following = asyncio.create_task(shown.follow())
+        try:
+            result = await supervisor.run()
+        finally:
+            following.cancel()
+            await asyncio.gather(following, return_exceptions=True)
+        shown.write(result.outcome.value, result.reason)
+    return result
+
+
+def train_command(options: TrainConfig) -> int:
+    """`slipstream train dqn`; the exit code."""
+    folder, run = prepare(options)
+    say(f"run: {folder}  ({', '.join(run.scenes)}, preset {options.preset})")
+    if options.serial:
+        from launch.serial import run_serial
+
+        run_serial(folder, run)
+    else:
+        result = asyncio.run(supervise(folder, run, view=options.view))
+        if result.outcome is Outcome.INTERRUPTED:
+            say(
+                f"interrupted; go on with: slipstream train dqn --resume --run {folder}"
+            )
+            return 130
+        if result.outcome is Outcome.FAILED:
+            raise LaunchError(result.reason)
+    finish(folder, run)
+    return 0
+
+
+def finish(folder: Path, run: RunFile) -> None:
+    """Draws the curves, scores the agent on the held-out scenes and records it."""
+    from actors.policy import find_policy
+    from launch.evaluate import record, report
+    from learner.curves import plot_curves
+
+    plot_curves(folder / "curves.csv", folder / "curves.png", title=str(folder))
+    bank = open_bank(folder / SCENES / HELD_OUT)
+    results = report(folder, run.config, bank, find_policy(folder))
+    recording = record(folder, run.config, bank, results[0])
+    print(f"curves: {folder / 'curves.png'}")
+    if recording is not None:
+        print(f"recording: {recording}  (slipstream view {folder})")
