@@ -34,7 +34,7 @@ def labels_of(config: ActionConfig) -> ActionLabels:
 
 def chained(
     segments: Float[np.ndarray, "segments 4"], kinds: Int[np.ndarray, " segments"]
-) -> tuple[tuple[RoadKind, Float[np.ndarray, "points 3"]], ...]:
+) -> tuple[tuple[RoadKind, Float[np.ndarray, "_ 3"]], ...]:
     """Joins segments, each beginning where the one before it ends, to polylines.
 
     Polygons end where they have come back to their beginning, which they then repeat

@@ -28,14 +28,15 @@ def vectors(
 
     `BarChart.columns` takes a single tensor (rerun 0.41), so Arrow joins them.
     """
-    name = f"BarChart:{component}"
-    arrays, descriptor = [], rr.ComponentDescriptor(name)
-    for row in rows.astype(np.float32):
-        chart = rr.BarChart(row, abscissa=row)
-        for batch in chart.as_component_batches():
-            if batch.component_descriptor().component == name:
-                descriptor = batch.component_descriptor()
-                arrays.append(batch.as_arrow_array())
+    descriptor = rr.ComponentDescriptor(
+        f"BarChart:{component}",
+        archetype="rerun.archetypes.BarChart",
+        component_type="rerun.components.TensorData",
+    )
+    arrays = [
+        rr.components.TensorDataBatch(row).as_arrow_array()
+        for row in rows.astype(np.float32)
+    ]
     return rr.ComponentColumn(descriptor, _Arrow(pa.concat_arrays(arrays)))
 
 

@@ -38,7 +38,7 @@ class ViewScene:
 
     scenario_id: str
     dt: float  # s between steps
-    polylines: tuple[tuple[RoadKind, Float[np.ndarray, "points 3"]], ...]
+    polylines: tuple[tuple[RoadKind, Float[np.ndarray, "_ 3"]], ...]
     position: Float[np.ndarray, "objects steps 3"]  # m, the box's centre
     yaw: Float[np.ndarray, "objects steps"]  # rad
     speed: Float[np.ndarray, "objects steps"]  # m/s
