@@ -15,7 +15,7 @@ import hashlib
 import json
 import mmap
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,14 +95,29 @@ def write_bank(
     path: Path,
     *,
     progress: Callable[[int], None] | None = None,
+    workers: int | None = None,
 ) -> None:
-    """Converts scenes and writes them under `path` only once the file is whole."""
-    converted, ids, origins, dts = [], [], [], set()
-    for scene in scenes:
-        converted.append(convert.convert(scene))
-        ids.append(scene.scenario_id)
-        origins.append(tuple(float(value) for value in convert.origin_of(scene)))
-        dts.add(round(scene.dt, 6))
+    """Converts scenes and writes them under `path` only once the file is whole.
+
+    Args:
+        scenes: any number; all of one step length.
+        path: the bank's file; a partial one beside it is renamed at the end.
+        progress: told how many scenes are converted.
+        workers: processes that convert; as many as there are cores unless given.
+    """
+    ids, origins, dts = [], [], set()
+
+    def noted() -> Iterator[Scene]:
+        for scene in scenes:
+            ids.append(scene.scenario_id)
+            origins.append(tuple(float(value) for value in convert.origin_of(scene)))
+            dts.add(round(scene.dt, 6))
+            yield scene
+
+    converted = []
+    workers = os.cpu_count() or 1 if workers is None else workers
+    for part in convert.convert_all(noted(), workers=workers):
+        converted.append(part)
         if progress:
             progress(len(converted))
     if not converted:

@@ -1,5 +1,10 @@
 """From a `Scene` to the rows of the bank (`sim.bank.Bank` says what each means)."""
 
+import itertools
+import multiprocessing
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -8,11 +13,14 @@ from jaxtyping import Bool, Float, Int
 from sim import edge_table, tables
 from sim.scene import Scene
 
+Converted = dict[str, Any]  # one scene's part of every array of the bank
+
 LOG_FIELDS = ("x", "y", "z", "yaw", "v_x", "v_y", "length", "width")
 ROUTE_POINTS = 64
 ROUTE_AHEAD = 40.0  # m that a route goes on straight behind the log's end
 ROUTE_STEP = 0.5  # m: shorter moves are jitter of a standing object
 ROWS = 64  # road segments kept per cell
+FEW = 12  # scenes
 MAX_CANDIDATES = 32  # edges per fine cell; measured: 12 to 30 at the 99th percentile
 
 
@@ -24,7 +32,7 @@ def origin_of(scene: Scene) -> Float[np.ndarray, "3"]:
     return np.round(scene.position[scene.sdc_index, step])
 
 
-def convert(scene: Scene) -> dict[str, Any]:
+def convert(scene: Scene) -> Converted:
     """The scene's own part of every array of the bank, positions local."""
     origin = origin_of(scene)
     log, valid = _log(scene, origin)
@@ -64,6 +72,29 @@ def convert(scene: Scene) -> dict[str, Any]:
         "fine_edges": fine_edges,
         "edges": _moved(edges, origin).packed(),
     }
+
+
+def convert_all(scenes: Iterable[Scene], *, workers: int) -> Iterator[Converted]:
+    """Converts scenes in order, several at once in processes of their own.
+
+    The processes start only when `FEW` scenes have come: until then they cost more than
+    they save. At most a few scenes per process wait, however many there are.
+    """
+    source = iter(scenes)
+    first = list(itertools.islice(source, FEW))
+    if workers < 2 or len(first) < FEW:
+        yield from map(convert, itertools.chain(first, source))
+        return
+    # Spawned, not forked: JAX's threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        pending: deque[Future[Converted]] = deque()
+        for scene in itertools.chain(first, source):
+            pending.append(pool.submit(convert, scene))
+            if len(pending) > 4 * workers:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
 
 
 def _check_small(scene: Scene, what: str, count: int, limit: int) -> None:
@@ -193,8 +224,8 @@ def _nested(
     return cells, parts[mixed]
 
 
-def stack(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Puts the scenes' parts together: padded where fixed, one behind the other else."""
+def stack(scenes: list[Converted]) -> dict[str, np.ndarray]:
+    """Joins the scenes: padded where fixed, else one behind the other."""
     steps = max(len(scene["log"]) for scene in scenes)
     objects = max(scene["log"].shape[1] for scene in scenes)
     lights = max(1, max(len(scene["light_position"]) for scene in scenes))
@@ -250,7 +281,7 @@ def stack(scenes: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _starts(scenes: list[dict[str, Any]], name: str) -> Int[np.ndarray, " scenes"]:
+def _starts(scenes: list[Converted], name: str) -> Int[np.ndarray, " scenes"]:
     lengths = [len(scene[name]) for scene in scenes]
     return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32)
 

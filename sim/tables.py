@@ -7,6 +7,7 @@ centre, nearest first, for the observation. Polylines are decimated (Douglas-Peu
 metric's table over the same grid is `sim.edge_table`.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ FINE = 4  # fine cells a side of a cell
 EDGE_CELL = CELL / FINE
 MARGIN = 10.0  # m around the map's and the logs' bounding box
 ROW_TOLERANCE = 0.15  # m
+BLOCK = 8  # cells a side of the squares that `row_table` looks at together
 ROW_REACH = 25.0  # m: a cell farther than this from every segment lists none
 
 ROW_KINDS = (
@@ -47,9 +49,9 @@ class Grid:
         """The same area in cells of `EDGE_CELL`."""
         return Grid(self.origin, (self.shape[0] * FINE, self.shape[1] * FINE))
 
-    def centres(self) -> Float[np.ndarray, "cells 2"]:
-        """The cells' centres [m]."""
-        i, j = np.divmod(np.arange(self.cells), self.shape[1])
+    def centres(self, cells: Int[np.ndarray, " cells"]) -> Float[np.ndarray, "cells 2"]:
+        """The centres of these cells [m]."""
+        i, j = np.divmod(cells, self.shape[1])
         return self.origin + CELL * (np.stack([i, j], -1) + 0.5)
 
 
@@ -133,38 +135,64 @@ def row_table(
     count = min(rows, len(segments))
     row_of = np.full(grid.cells, -1, np.int32)
     found = [np.zeros((0, rows), np.uint16)]
-    centres = grid.centres().astype(np.float32)
-    start = segments[:, :2].astype(np.float32)
-    along = (segments[:, 2:] - segments[:, :2]).astype(np.float32)
-    squared = np.maximum((along**2).sum(-1), 1e-9)
-    for first in range(0, grid.cells if count else 0, 256):
-        distance = _squared_distance(
-            centres[first : first + 256], start, along, squared
-        )
+    kept = 0
+    for cells in _blocks(grid) if count else ():
+        centres = grid.centres(cells)
+        candidates = _block_segments(centres, segments, count)
+        if not len(candidates):
+            continue
+        distance = _squared_distance(centres, segments[candidates])
         near = np.flatnonzero(distance.min(1) <= ROW_REACH**2)
         distance = distance[near]
-        if count < len(segments):
+        if count < len(candidates):
             part = np.argpartition(distance, count - 1, axis=1)[:, :count]
         else:
-            part = np.broadcast_to(np.arange(count), distance.shape)
+            part = np.broadcast_to(np.arange(len(candidates)), distance.shape)
         order = np.take_along_axis(distance, part, 1).argsort(1, kind="stable")
         nearest = np.zeros((len(near), rows), np.uint16)
-        nearest[:, :count] = np.take_along_axis(part, order, 1)
-        row_of[first + near] = sum(map(len, found)) + np.arange(len(near))
+        nearest[:, :count] = candidates[np.take_along_axis(part, order, 1)]
+        row_of[cells[near]] = kept + np.arange(len(near))
+        kept += len(near)
         found.append(nearest)
-    kept = np.concatenate(found)
-    return row_of, kept, np.full(len(kept), count, np.uint16)
+    return row_of, np.concatenate(found), np.full(kept, count, np.uint16)
+
+
+def _blocks(grid: Grid) -> Iterator[Int[np.ndarray, " cells"]]:
+    """The cells' numbers, `BLOCK` by `BLOCK`."""
+    numbers = np.arange(grid.cells).reshape(grid.shape)
+    for i in range(0, grid.shape[0], BLOCK):
+        for j in range(0, grid.shape[1], BLOCK):
+            yield numbers[i : i + BLOCK, j : j + BLOCK].ravel()
+
+
+def _block_segments(
+    centres: Float[np.ndarray, "cells 2"],
+    segments: Float[np.ndarray, "segments 4"],
+    count: int,
+) -> Int[np.ndarray, " candidates"]:
+    """The segments that can be among the `count` nearest of a cell of a block.
+
+    Distance changes by at most the way between two points: from the block's middle,
+    what is farther than the `count`-th nearest by twice the block's radius is out. A
+    block that the map is out of reach of has none.
+    """
+    middle = (centres.min(0) + centres.max(0)) / 2
+    radius = float(np.hypot(*(centres.max(0) - middle)))
+    distance = np.sqrt(_squared_distance(middle[None], segments))[0]
+    if distance.min() > ROW_REACH + radius:
+        return np.zeros(0, np.int64)
+    bound = np.partition(distance, count - 1)[count - 1] + 2 * radius + 0.01
+    return np.flatnonzero(distance <= bound)
 
 
 def _squared_distance(
-    points: Float[np.ndarray, "points 2"],
-    start: Float[np.ndarray, "segments 2"],
-    along: Float[np.ndarray, "segments 2"],
-    squared: Float[np.ndarray, " segments"],
+    points: Float[np.ndarray, "points 2"], segments: Float[np.ndarray, "segments 4"]
 ) -> Float[np.ndarray, "points segments"]:
     """Squared distance of every point from every segment [m^2]."""
-    x = points[:, None, 0] - start[:, 0]
-    y = points[:, None, 1] - start[:, 1]
+    along = segments[:, 2:] - segments[:, :2]
+    squared = np.maximum((along**2).sum(-1), 1e-9)
+    x = points[:, None, 0] - segments[:, 0]
+    y = points[:, None, 1] - segments[:, 1]
     t = np.clip((x * along[:, 0] + y * along[:, 1]) / squared, 0.0, 1.0)
     x -= t * along[:, 0]
     y -= t * along[:, 1]
