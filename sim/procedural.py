@@ -46,7 +46,7 @@ _FAMILY_SHARES = (0.35, 0.4, 0.25)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Objects:
+class Objects:
     """The objects of a scene in the layout's frame, one row each."""
 
     kind: Int[np.ndarray, " a"]  # `ObjectType`
@@ -56,9 +56,9 @@ class _Objects:
     valid: Bool[np.ndarray, "a t"]
     room: Float[np.ndarray, " a"]  # m of path left after `CURRENT_STEP`
 
-    def keep(self, rows: Bool[np.ndarray, " a"] | Int[np.ndarray, " b"]) -> "_Objects":
+    def keep(self, rows: Bool[np.ndarray, " a"] | Int[np.ndarray, " b"]) -> "Objects":
         """Only these rows."""
-        return _Objects(
+        return Objects(
             kind=self.kind[rows],
             pose=self.pose[rows],
             speed=self.speed[rows],
@@ -96,9 +96,9 @@ def _scene(seed: int, index: int) -> Scene:
 
 def _gather(
     rng: np.random.Generator, layout: Layout, fleet: Fleet, motion: Motion
-) -> _Objects:
+) -> Objects:
     """Traffic, parked vehicles and people on the pavement as rows."""
-    traffic = _drivers(layout, fleet, motion)
+    traffic = follow(layout, fleet, motion)
     parked = layout.parking[rng.random(len(layout.parking)) < rng.uniform(0.4, 0.9)]
     standing = np.tile(parked[:, None], (1, STEPS, 1))
     sizes = [draw_size(rng, ObjectType.VEHICLE, 0.0) for _ in parked]
@@ -112,7 +112,7 @@ def _gather(
     paces = np.array([pace for _, pace in people])
     extra = len(parked) + len(people)
     speed = np.concatenate([np.zeros(len(parked)), paces])
-    return _Objects(
+    return Objects(
         kind=np.concatenate(
             [
                 traffic.kind,
@@ -128,7 +128,7 @@ def _gather(
     )
 
 
-def _drivers(layout: Layout, fleet: Fleet, motion: Motion) -> _Objects:
+def follow(layout: Layout, fleet: Fleet, motion: Motion) -> Objects:
     """Poses of those who follow paths."""
     pose = np.zeros((*motion.station.shape, 3))
     speed = np.zeros_like(motion.station)
@@ -144,7 +144,7 @@ def _drivers(layout: Layout, fleet: Fleet, motion: Motion) -> _Objects:
         pose[row] = np.stack([x - left * np.sin(yaw), y + left * np.cos(yaw), yaw], -1)
         speed[row] = motion.speed[row] * (1 - bend * left)
         room[row] = path.length - motion.station[row, CURRENT_STEP]
-    return _Objects(
+    return Objects(
         kind=fleet.kind,
         pose=pose,
         speed=speed,
@@ -166,7 +166,7 @@ def _stroll(
     return np.stack([np.interp(at, index, c) for c in columns], axis=-1), pace
 
 
-def _clean(objects: _Objects, edges: EdgeMap) -> _Objects:
+def _clean(objects: Objects, edges: EdgeMap) -> Objects:
     """Removes who leaves the road or comes too near to another."""
     vehicle = objects.kind == ObjectType.VEHICLE
     size = objects.size[:, :2]
@@ -189,9 +189,7 @@ def _clean(objects: _Objects, edges: EdgeMap) -> _Objects:
     return objects.keep(~gone)
 
 
-def _recorder(
-    rng: np.random.Generator, objects: _Objects, edges: EdgeMap
-) -> int | None:
+def _recorder(rng: np.random.Generator, objects: Objects, edges: EdgeMap) -> int | None:
     """The row of the recording vehicle, or None if nobody will do."""
     driven = objects.speed[:, CURRENT_STEP:].sum(axis=1) * DT
     enough = 30.0 if rng.random() < 0.95 else 12.0
@@ -211,7 +209,7 @@ def _recorder(
     return int(candidates[0]) if len(candidates) else None
 
 
-def _coast(objects: _Objects, edges: EdgeMap, row: int) -> tuple[bool, bool]:
+def _coast(objects: Objects, edges: EdgeMap, row: int) -> tuple[bool, bool]:
     """How this vehicle fails (overlap, off-road) by keeping heading and speed."""
     start = objects.pose[row, CURRENT_STEP]
     far = objects.speed[row, CURRENT_STEP] * DT * np.arange(STEPS - CURRENT_STEP)
@@ -227,7 +225,7 @@ def _coast(objects: _Objects, edges: EdgeMap, row: int) -> tuple[bool, bool]:
 
 
 def _finish(
-    rng: np.random.Generator, layout: Layout, objects: _Objects, sdc: int, name: str
+    rng: np.random.Generator, layout: Layout, objects: Objects, sdc: int, name: str
 ) -> Scene:
     """Keeps the nearest objects and puts everything into the world."""
     here = objects.pose[:, CURRENT_STEP, :2]

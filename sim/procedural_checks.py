@@ -5,6 +5,8 @@ off-road test looks up the nearest piece of road edge by the pieces' midpoints a
 then decides exactly among it and its neighbours; `sim.metrics` has the definition.
 """
 
+from typing import final
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -72,6 +74,7 @@ def overlaps(
     return result | result.T
 
 
+@final
 class EdgeMap:
     """Road edges cut into short pieces, for quick off-road tests."""
 

@@ -7,6 +7,7 @@ goes straight on to k + 2 and turns left into k + 3. Legs of one road are alike.
 """
 
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -221,6 +222,7 @@ def _mark(builder: MapBuilder, leg: _Leg) -> None:
     builder.add(RoadKind.CROSSWALK, np.array([leg.at(*corner) for corner in ring]))
 
 
+@final
 class _Ways:
     """Collects lanes, paths and lights while the legs are connected."""
 

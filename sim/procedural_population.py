@@ -1,5 +1,7 @@
 """Who takes part in a procedural scene: sizes, temperaments, starting places."""
 
+from typing import final
+
 import numpy as np
 from jaxtyping import Float
 
@@ -23,6 +25,7 @@ def draw_size(
     return rng.uniform(4.2, 5.2), rng.uniform(1.8, 2.1), rng.uniform(1.45, 1.9)
 
 
+@final
 class _Crowd:
     """Road users that were placed so far."""
 

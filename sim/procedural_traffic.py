@@ -16,6 +16,7 @@ a free term that also tracks a falling speed profile. The gap is the smallest to
 """
 
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -128,6 +129,7 @@ def _zones(
     return enter, leave
 
 
+@final
 class _Drive:
     """One simulation; holds what does not change from step to step."""
 

@@ -1,10 +1,15 @@
-"""The plane curves and quick checks under the procedural scenes."""
+"""The curves, quick checks and traffic under the procedural scenes."""
 
 import numpy as np
 
-from sim.procedural import generate_many
+from sim.procedural import follow, generate_many
 from sim.procedural_checks import EdgeMap, overlaps
+from sim.procedural_crossing import crossing
 from sim.procedural_geometry import STEP, decimate, integrate, turn
+from sim.procedural_merge import merge
+from sim.procedural_population import populate
+from sim.procedural_roads import curved_road
+from sim.procedural_traffic import simulate
 from tests import oracle
 
 
@@ -61,3 +66,16 @@ def test_quick_checks_agree_with_the_oracle() -> None:
     boxes = oracle.corners(pose[:2].T, pose[2], size[:, 0], size[:, 1])
     mine = overlaps(pose.T[:, None], size, np.ones((60, 1), dtype=bool), 0.0)
     np.testing.assert_array_equal(mine, oracle.boxes_overlap(boxes))
+
+
+def test_hardly_anybody_has_to_be_removed() -> None:
+    """The traffic itself keeps apart; the final check is a safety net."""
+    meetings = []
+    for seed in range(24):
+        rng = np.random.default_rng(seed)
+        layout = (curved_road, crossing, merge)[seed % 3](rng, 111)
+        fleet = populate(rng, layout)
+        objects = follow(layout, fleet, simulate(layout, fleet, 20, 91))
+        meet = overlaps(objects.pose, objects.size[:, :2], objects.valid, 0.3)
+        meetings.append(int(meet.any(axis=1).sum()))
+    assert np.mean(meetings) < 1.0, meetings
