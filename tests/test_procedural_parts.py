@@ -1,11 +1,15 @@
 """The curves, quick checks and traffic under the procedural scenes."""
 
+from collections.abc import Callable
+
 import numpy as np
+import pytest
 
 from sim.procedural import follow, generate_many
 from sim.procedural_checks import EdgeMap, overlaps
 from sim.procedural_crossing import crossing
 from sim.procedural_geometry import STEP, decimate, integrate, turn
+from sim.procedural_map import Layout
 from sim.procedural_merge import merge
 from sim.procedural_population import populate
 from sim.procedural_roads import curved_road
@@ -68,14 +72,19 @@ def test_quick_checks_agree_with_the_oracle() -> None:
     np.testing.assert_array_equal(mine, oracle.boxes_overlap(boxes))
 
 
-def test_hardly_anybody_has_to_be_removed() -> None:
-    """The traffic itself keeps apart; the final check is a safety net."""
+@pytest.mark.parametrize("family", [curved_road, crossing, merge])
+def test_hardly_anybody_has_to_be_removed(family: Callable[..., Layout]) -> None:
+    """The traffic itself keeps apart; the final check is a safety net.
+
+    Objects a scene that meet another: 0 to 0.1 here; without yielding 0.7 on
+    crossings, without the zipper rule 1.2 on merges.
+    """
     meetings = []
-    for seed in range(24):
+    for seed in range(16):
         rng = np.random.default_rng(seed)
-        layout = (curved_road, crossing, merge)[seed % 3](rng, 111)
+        layout = family(rng, 111)
         fleet = populate(rng, layout)
         objects = follow(layout, fleet, simulate(layout, fleet, 20, 91))
         meet = overlaps(objects.pose, objects.size[:, :2], objects.valid, 0.3)
         meetings.append(int(meet.any(axis=1).sum()))
-    assert np.mean(meetings) < 1.0, meetings
+    assert np.mean(meetings) < 0.4, meetings
