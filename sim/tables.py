@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt
 
 from sim.scene import Polyline, RoadKind, Scene
 
@@ -125,7 +125,7 @@ def _split(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "more 2"]
 def row_table(
     grid: Grid, segments: Float[np.ndarray, "segments 4"], rows: int
 ) -> tuple[
-    Int[np.ndarray, " cells"], Int[np.ndarray, "kept rows"], Int[np.ndarray, " kept"]
+    Int[np.ndarray, " cells"], UInt[np.ndarray, "kept rows"], UInt[np.ndarray, " kept"]
 ]:
     """The `rows` segments nearest to each cell's centre, nearest first, and how many.
 
