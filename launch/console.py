@@ -157,6 +157,8 @@ class RunConsole:
         self._supervisor = supervisor
         self._console = console
         self._on_look = on_look
+        self._session: zenoh.Session | None = None
+        self._statuses: StatusSubscriber | None = None
         self._rate = _Rate()
         self._stats: dict[str, Any] = {}
         self._cpu: dict[int, psutil.Process] = {}
@@ -165,48 +167,55 @@ class RunConsole:
 
     async def follow(self) -> None:
         """Shows the run until cancelled."""
-        session = await asyncio.to_thread(self._connect)
-        with session:
-            statuses = StatusSubscriber(session, self._keys)
-            if self._console.is_terminal:
-                await self._live(session, statuses)
-            else:
-                await self._plain(session, statuses)
+        with await self._connect() as session:
+            self._session = session
+            self._statuses = StatusSubscriber(session, self._keys)
+            try:
+                await (self._live() if self._console.is_terminal else self._plain())
+            finally:
+                self._session = None
 
-    def _connect(self) -> "zenoh.Session":
+    async def last_look(self) -> None:
+        """The final counters, while the replay service is still up."""
+        if self._session is not None:
+            await self._look()
+
+    async def _connect(self) -> "zenoh.Session":
         while True:
             try:
-                return open_session(connect=[self._endpoint], timeout_s=60.0)
+                # Short attempts: a thread cannot be cancelled, and Ctrl-C waits for it.
+                return await asyncio.to_thread(
+                    open_session, connect=[self._endpoint], timeout_s=0.2
+                )
             except ConnectError:
                 continue  # the supervisor says so when the service cannot start
 
-    async def _live(self, session: "zenoh.Session", statuses: StatusSubscriber) -> None:
+    async def _live(self) -> None:
         with Live(console=self._console, auto_refresh=False) as live:
             while True:
-                await self._look(session, statuses)
+                await self._look()
                 live.update(self._table(), refresh=True)
                 await asyncio.sleep(_TERMINAL_S)
 
-    async def _plain(
-        self, session: "zenoh.Session", statuses: StatusSubscriber
-    ) -> None:
+    async def _plain(self) -> None:
         due = time.monotonic() + _PLAIN_S
         while True:
-            await self._look(session, statuses)
+            await self._look()
             if time.monotonic() >= due:
                 due = time.monotonic() + _PLAIN_S
                 print(line_of(self.figures), flush=True)
             await asyncio.sleep(_TERMINAL_S)
 
-    async def _look(self, session: "zenoh.Session", statuses: StatusSubscriber) -> None:
+    async def _look(self) -> None:
+        assert self._session is not None and self._statuses is not None
         try:
             self._stats = await asyncio.to_thread(
-                fetch_stats, session, self._keys, timeout=1.0
+                fetch_stats, self._session, self._keys, timeout=1.0
             )
         except ReplayError:
             pass  # not up yet, or busy: the last counters stand
         now = time.monotonic()
-        roles = statuses.latest()
+        roles = self._statuses.latest()
         figures = snapshot(self._config, roles, self._stats, now)
         figures["steps_per_s"] = self._rate.add(now, figures["steps"])
         figures["looked_s"] = now

@@ -6,9 +6,10 @@ is a summary of them.
 """
 
 import dataclasses
+import itertools
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +22,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from actors.evaluation import Evaluation, Trace, evaluate
-from actors.frames import FrameBatch, make_frames
+from actors.evaluation import Evaluation, evaluate
+from actors.frames import FrameBatch
 from actors.policy import greedy, random_vector, read_policy
 from launch.config import ExperimentConfig, ScenesConfig, quick, write_atomically
 from launch.errors import LaunchError
@@ -230,59 +231,17 @@ def compare(
     return results
 
 
-def rollouts(
-    evaluation: Evaluation, bank: BankFile, *, most: int, version: int
-) -> Iterator[tuple[str, FrameBatch]]:
-    """The trained agent's rollouts as frames: failed ones first, then the others."""
-    trace = evaluation.trace
-    if trace is None:
-        return
-    order = sorted(
-        range(bank.scenes), key=lambda row: not evaluation.scenes[row].failed
-    )
-    shown = _interleaved(order, evaluation)[:most]
-    for row in shown:
-        result = evaluation.scenes[row]
-        how = "failed" if result.failed else "drove through"
-        batch = _frames(trace, bank, row, version)
-        if len(batch):
-            yield f"{evaluation.agent}, {result.id}: {how}", batch
-
-
-def _interleaved(order: Sequence[int], evaluation: Evaluation) -> list[int]:
-    """Failed and successful rollouts in turns: a recording of one kind misleads."""
-    failed = [row for row in order if evaluation.scenes[row].failed]
-    others = [row for row in order if not evaluation.scenes[row].failed]
-    mixed = []
-    for index in range(max(len(failed), len(others))):
-        mixed += others[index : index + 1] + failed[index : index + 1]
-    return mixed
-
-
-def _frames(trace: Trace, bank: BankFile, row: int, version: int) -> FrameBatch:
-    """One scene's steps, up to the recording's end."""
-    start = int(bank.arrays["current_step"][row])
-    steps = int(bank.arrays["steps"][row]) - 1 - start
-    part = jax.tree.map(lambda values: values[row][:steps], trace)
-    return FrameBatch(
-        actor=0,
-        environment=0,
-        actor_steps=0,
-        weights_version=version,
-        frames=make_frames(
-            steps,
-            scene=np.full(steps, row),
-            step=part.step,
-            controlled=np.full(steps, int(bank.arrays["sdc"][row])),
-            state=part.states[:, 0],
-            action=part.action[:, 0],
-            reward=part.reward[:, 0],
-            progress=part.progress[:, 0],
-            overlap=part.overlap[:, 0],
-            offroad=part.offroad[:, 0],
-        ),
-        q_values=part.q_values[:, 0],
-    )
+def chosen(
+    evaluation: Evaluation, rollouts: Iterable[tuple[str, FrameBatch]], *, most: int
+) -> list[tuple[str, FrameBatch]]:
+    """Rollouts to record, failed and successful ones in turns: one kind misleads."""
+    kinds: dict[bool, list[tuple[str, FrameBatch]]] = {False: [], True: []}
+    for name, batch in rollouts:
+        scene = evaluation.scenes[int(batch.frames["scene"][0])]
+        how = "fails" if scene.failed else "drives through"
+        kinds[scene.failed].append((f"{name} {how}, scene {scene.id}", batch))
+    pairs = itertools.zip_longest(kinds[False], kinds[True])
+    return [one for pair in pairs for one in pair if one is not None][:most]
 
 
 def report(
@@ -310,14 +269,16 @@ def record(
     """Writes the recording of the trained agent; None where Rerun is not installed."""
     try:
         from launch.bank_view import bank_scenes, labels_of
-        from launch.recording import record_evaluation
+        from launch.recording import record_evaluation, rollouts_of
     except ImportError:
         return None
     path = folder / "evaluation.rrd"
     record_evaluation(
         path,
         scene_of=bank_scenes(bank),
-        rollouts=rollouts(trained, bank, most=config.report.rollouts, version=0),
+        rollouts=chosen(
+            trained, rollouts_of(trained, bank), most=config.report.rollouts
+        ),
         actions=labels_of(config.environment.action),
     )
     return path

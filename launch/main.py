@@ -37,9 +37,10 @@ def _parse(options: Any, words: Sequence[str], prog: str, **settings: Any) -> An
     except SystemExit as ended:
         if not ended.code:
             raise
-        raise LaunchError(f"{prog}: {_one_line(boxed.getvalue())}") from None
+        command = prog.removeprefix("slipstream ")
+        raise LaunchError(f"{command}: {_one_line(boxed.getvalue())}") from None
     except ValueError as error:  # of a configuration's own check
-        raise LaunchError(f"{prog}: {error}") from error
+        raise LaunchError(str(error)) from error
 
 
 def _one_line(box: str) -> str:
@@ -48,6 +49,7 @@ def _one_line(box: str) -> str:
     text = re.sub(r"\s+", " ", " ".join(line for line in lines if line))
     text = re.sub(r"\x1b\[[0-9;]*m|[─━═]{2,}", " ", text)
     text = re.sub(r"^\W*(Parsing error|Value error|Missing argument) ", "", text)
+    text = re.sub(r"^Required options Missing from [^:]*: (\w)", r"missing --\1", text)
     text = re.sub(r"^Unrecognized options (?=Unrecognized)", "", text)
     text = re.sub(r" *(Argument helptext|For full helptext).*$", "", text)
     return f"{text.strip() or 'cannot be parsed'}; see --help"
@@ -157,11 +159,9 @@ def find(words: list[str]) -> tuple[str, list[str]]:
     first = words[0]
     nested = [name.split()[1] for name in COMMANDS if name.split()[0] == first]
     if not nested:
-        raise LaunchError(f"slipstream {first}: no such command; see slipstream --help")
+        raise LaunchError(f"{first}: no such command; see slipstream --help")
     given = words[1] if len(words) > 1 else "nothing"
-    raise LaunchError(
-        f"slipstream {first}: expected {' or '.join(nested)} and not {given}"
-    )
+    raise LaunchError(f"{first}: expected {' or '.join(nested)} and not {given}")
 
 
 def _dispatch(words: list[str]) -> int:

@@ -23,7 +23,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, final
@@ -84,9 +84,11 @@ class Supervisor:
         backoff_s: float = 0.5,
         max_failures: int = 6,
         on_event: Callable[[str], None] = print,
+        before_stop: Callable[[], Awaitable[None]] | None = None,
     ) -> None:
         """Takes the roles in the order in which they start.
 
+        `before_stop` is awaited when a run has finished, all other roles still up.
         A role that fails `max_failures` times in a row, each within a minute of its
         start, fails the run: starting it once more would not cure it.
         """
@@ -96,6 +98,7 @@ class Supervisor:
         self._backoff_s = backoff_s
         self._max_failures = max_failures
         self._on_event = on_event
+        self._before_stop = before_stop
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._keepers: list[asyncio.Task[None]] = []
         self._reaper: asyncio.subprocess.Process | None = None
@@ -127,10 +130,12 @@ class Supervisor:
             starter = asyncio.create_task(self._start_all())
             try:
                 await self._over.wait()
+                assert self._result is not None
+                if self._result.outcome is Outcome.FINISHED and self._before_stop:
+                    await self._before_stop()
             finally:
                 starter.cancel()
                 await self._stop_all()
-        assert self._result is not None
         return self._result
 
     @contextlib.contextmanager

@@ -204,6 +204,7 @@ async def supervise(
         roles=roles_of(folder, run, port, view=view),
         log_folder=folder / LOGS,
         on_event=lambda line: console.print(line, highlight=False),
+        before_stop=lambda: shown.last_look(),
     )
     shown = RunConsole(
         config=run.config,

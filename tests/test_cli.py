@@ -1,0 +1,237 @@
+"""The command line: what it does, and the one line for each bad input."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from launch.config import RunFile, quick
+from launch.main import main, usage
+
+TINY = ("--scenes.train", "2", "--scenes.held-out", "2")
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """The one line with which a command refuses; nothing else is printed."""
+    capsys.readouterr()
+    assert main([str(word) for word in words]) == 2
+    captured = capsys.readouterr()
+    assert "Traceback" not in captured.err
+    lines = [line for line in captured.err.split("\n") if line]
+    assert len(lines) == 1, lines
+    assert captured.out == ""
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two procedural scenes."""
+    path = tmp_path_factory.mktemp("bank") / "two.bank"
+    words = ["scenes", "procedural", "--count", "2", "--out", str(path)]
+    assert main(words) == 0
+    return path
+
+
+def test_what_it_offers_needs_no_heavy_import() -> None:
+    code = (
+        "import sys; from launch.main import main; main(['--help']);"
+        "assert not {'jax', 'torch', 'zenoh'} & set(sys.modules)"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert "train dqn" in ran.stdout
+
+
+def test_a_person_without_a_command_gets_the_list(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main([]) == 2
+    assert capsys.readouterr().out == usage() + "\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["fly"], "no such command"),
+        (["train"], "expected dqn"),
+        (["train", "ppo"], "expected dqn and not ppo"),
+        (["scenes", "eat"], "convert or info or procedural"),
+        (["train", "dqn", "--preset", "slow"], "choose one of quick, paper"),
+        (["train", "dqn", "--spped", "1"], "--spped"),
+        (["train", "dqn", "--actors", "many"], "many"),
+        (["train", "dqn", "--actors", "0"], "actors=0 must be at least 1"),
+        (["train", "dqn", "--network.width", "33"], "heads=2 must divide width=33"),
+        (["train", "dqn", "--envs", "512"], "would deadlock"),
+        (["train", "dqn", "--resume", "--run", "nowhere"], "no run to resume"),
+        (["train", "dqn", "--run", "new", "--scenes", "nowhere"], "no such file"),
+        (["evaluate", "--agent", "ghost"], "unknown; one of log, expert"),
+        (["evaluate"], "--agent"),
+        (["evaluate", "--agent", "expert", "--scenes", "nowhere"], "no such file"),
+        (["scenes", "procedural", "--count", "0", "--out", "x"], "must be at least 1"),
+        (["scenes", "info", "nowhere"], "no such file"),
+        (["view", "nowhere"], "no such file or folder"),
+        (["replay", "--run-id", "r"], "--listen"),
+        (["actor", "--run-id", "r"], "--connect"),
+        (["actor", "--run-id", "r", "--connect", "here"], "PROTOCOL/HOST:PORT"),
+        (["actor", "--run-id", "a/b", "--connect", "tcp/127.0.0.1:1"], "run id"),
+        (["learner", "--run-id", "r", "--connect", "tcp/10.0.0.1:1"], "--insecure"),
+    ],
+)
+def test_a_mistake_gets_one_line(
+    words: list[str],
+    expected: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert expected in refusal(capsys, *words)
+
+
+def test_a_run_is_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = RunFile(
+        run_id="r", config=quick(), train_hash="", held_out_hash="", scenes=()
+    )
+    run.write(tmp_path)
+    line = refusal(capsys, "train", "dqn", "--run", tmp_path)
+    assert "this run exists" in line and "--resume" in line
+
+
+def test_a_folder_of_other_things_is_not_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "thesis.tex").write_text("precious")
+    assert "not empty" in refusal(capsys, "train", "dqn", "--run", tmp_path)
+
+
+def test_no_permission(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Below a file nobody can write, whoever runs the tests."""
+    file = tmp_path / "file"
+    file.write_text("")
+    line = refusal(capsys, "train", "dqn", "--run", file / "run")
+    assert str(file) in line
+    line = refusal(
+        capsys, "scenes", "procedural", "--count", 1, "--out", file / "a.bank"
+    )
+    assert str(file) in line
+
+
+def test_a_bank_of_another_version(
+    bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = tmp_path / "old.bank"
+    old.write_bytes(bank.read_bytes().replace(b'"version": 1', b'"version": 7', 1))
+    line = refusal(capsys, "evaluate", "--agent", "expert", "--scenes", old)
+    assert "has version 7" in line
+
+
+def test_a_truncated_bank(
+    bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = tmp_path / "short.bank"
+    short.write_bytes(bank.read_bytes()[:-5])
+    assert "truncated" in refusal(capsys, "scenes", "info", short)
+
+
+def test_a_truncated_recording_names_the_byte(
+    scenes_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = scenes_data / "womd" / "motion_data_one_scenario.tfrecord"
+    short = tmp_path / "short.tfrecord"
+    short.write_bytes(whole.read_bytes()[:1000])
+    line = refusal(capsys, "scenes", "convert", short, "--out", tmp_path / "a.bank")
+    assert "byte" in line and str(short) in line
+    assert not (tmp_path / "a.bank").exists()
+
+
+def test_a_port_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = RunFile(
+        run_id="r", config=quick(), train_hash="", held_out_hash="", scenes=()
+    )
+    run.write(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        words = ["replay", "--run-id", "r", "--run", str(tmp_path)]
+        # In a process: a role takes over the signals of the one that it is in.
+        ended = subprocess.run(
+            [sys.executable, "-m", "launch", *words, "--listen", endpoint],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert ended.returncode == 2
+    assert ended.stderr.count("\n") == 1 and "port in use" in ended.stderr
+
+
+def test_a_checkpoint_of_another_network(
+    bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Weights whose layout is not the one that their file promises."""
+    from launch.learning import checkpoint_extra, make_learner
+    from learner.checkpoint import save_checkpoint
+
+    config = quick()
+    path = save_checkpoint(
+        tmp_path, learner=make_learner(config), extra=checkpoint_extra(config, 0.0)
+    )
+    words = ("evaluate", "--agent", tmp_path, "--scenes", bank, "--json", "-")
+    assert main([str(word) for word in words]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [scene["id"] for scene in result["scenes"]]
+    file = path / "policy.npz"
+    with np.load(file) as arrays:
+        parts = dict(arrays)
+    network = json.loads(str(parts["network"])) | {"width": 16}
+    np.savez(file, **parts | {"network": np.array(json.dumps(network))})
+    line = refusal(capsys, "evaluate", "--agent", tmp_path, "--scenes", bank)
+    assert "another network" in line
+
+
+def test_evaluation_counts_every_scene(
+    bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.json"
+    words = ("evaluate", "--agent", "log", "--objects", "all", "--scenes", bank)
+    assert main([str(word) for word in (*words, "--json", out)]) == 0
+    assert "failures" in capsys.readouterr().out
+    result = json.loads(out.read_text())
+    assert result["agent"] == "log" and len(result["scenes"]) == 2
+    for scene in result["scenes"]:
+        assert scene["valid"] >= scene["objects"] > 0
+        # The generator's traffic collides with nothing and stays on the road.
+        assert scene["overlap"] == scene["offroad"] == 0
+
+
+def test_info_tells_a_bank(bank: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", "info", str(bank), "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert len(content["scenes"]) == 2
+    assert len(content["hash"]) == 64
+
+
+def test_ctrl_c_is_130(tmp_path: Path) -> None:
+    """While scenes are made, long before there is a supervisor."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "launch", "train", "dqn", "--run", str(tmp_path / "r")],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while not (tmp_path / "r" / "scenes").exists():
+        assert process.poll() is None
+        os.sched_yield()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert errors == "interrupted\n"
+    shutil.rmtree(tmp_path / "r")
