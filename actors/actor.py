@@ -120,7 +120,7 @@ def run_actor(
             highest=config.epsilon_highest,
         )
     )
-    running = acting.start(
+    running = jax.jit(acting.start, static_argnums=(2, 3))(
         start_key, bank, config.environments, acting_config.environment
     )
     version, vector = -1, jnp.zeros(0)

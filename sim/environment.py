@@ -6,7 +6,9 @@ the action space's dynamics and all others to where they were recorded.
 
 Reward of the step from t-1 to t (Gulino et al., 2023, main text): minus overlap minus
 off-road at t. `progress` (off in the paper's preset) adds metres gained along the
-logged route, up to its end: the paper's reward alone is satisfied by standing still.
+logged route, up to its end, times 1 - (aside / `progress_width`)^2 while that is above
+0, `aside` being the distance from the route: the paper's reward alone is satisfied by
+standing still.
 
 Terminated is what ends the return (a failure, where `terminate` says so); truncated is
 the recording's end, after which there was more to come: only the first has discount 0.
@@ -43,6 +45,8 @@ class EnvironmentConfig:
     """Subtracted from the reward at a step off the road."""
     progress: float = 0.0
     """Reward per metre gained along the logged route; 0 is the paper's."""
+    progress_width: float = 4.0
+    """Distance aside from the route [m] at which progress counts for nothing."""
     terminate: bool = False
     """Whether a failure (overlap or off-road) ends the episode."""
     dt: float = 0.1
@@ -155,8 +159,9 @@ def advance(
     )
     end = bank.route_end[state.scene, state.controlled]
     gained = jnp.minimum(position.along, end) - jnp.minimum(state.along, end)
+    near = jnp.maximum(1.0 - (position.aside / config.progress_width) ** 2, 0.0)
     reward = (
-        config.progress * gained
+        config.progress * gained * near
         - config.overlap_penalty * overlap.astype(jnp.float32)
         - config.offroad_penalty * offroad.astype(jnp.float32)
     )
