@@ -5,6 +5,7 @@ generated. What a folder holds besides scenes is passed over with a word.
 """
 
 import json
+import os
 import sys
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -46,7 +47,7 @@ def _counted(scenes: Iterable[Scene], path: Path) -> None:
                 status.update(f"{path.name}: {count} scenes")
 
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_bank(scenes, path, progress=progress)
+        write_bank(scenes, path, progress=progress, workers=os.cpu_count() or 1)
 
 
 def write_procedural(path: Path, *, count: int, seed: int) -> BankFile:

@@ -95,7 +95,7 @@ def write_bank(
     path: Path,
     *,
     progress: Callable[[int], None] | None = None,
-    workers: int | None = None,
+    workers: int = 1,
 ) -> None:
     """Converts scenes and writes them under `path` only once the file is whole.
 
@@ -103,7 +103,8 @@ def write_bank(
         scenes: any number; all of one step length.
         path: the bank's file; a partial one beside it is renamed at the end.
         progress: told how many scenes are converted.
-        workers: processes that convert; as many as there are cores unless given.
+        workers: processes that convert. More than one are spawned, so the caller's main
+            module must be guarded by `if __name__ == "__main__"`.
     """
     ids, origins, dts = [], [], set()
 
@@ -115,7 +116,6 @@ def write_bank(
             yield scene
 
     converted = []
-    workers = os.cpu_count() or 1 if workers is None else workers
     for part in convert.convert_all(noted(), workers=workers):
         converted.append(part)
         if progress:
