@@ -46,7 +46,7 @@ COLUMNS: Final = (
     ("overlap_rate", "overlap", "{:.1%}"),
     ("offroad_rate", "off-road", "{:.1%}"),
     ("progress", "progress", "{:.2f}"),
-    ("log_displacement", "log displacement [m]", "{:.2f}"),
+    ("log_displacement", "from log [m]", "{:.2f}"),
     ("kinematic_infeasibility", "infeasible", "{:.1%}"),
 )
 
@@ -68,9 +68,9 @@ def summary(evaluation: Evaluation) -> dict[str, float | int | str | None]:
 def table_of(evaluations: Sequence[Evaluation], title: str) -> Table:
     """One row per agent."""
     table = Table(title=title)
-    table.add_column("agent")
+    table.add_column("agent", no_wrap=True)
     for _, heading, _ in COLUMNS:
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
     for evaluation in evaluations:
         figures = summary(evaluation)
         cells = [

@@ -267,6 +267,7 @@ def learner_role(join: JoinConfig, stop: threading.Event) -> None:
             keys=place.keys,
             spec=row_spec(config.environment.observation.history),
             batch_size=config.learner.batch_size,
+            in_flight=4,  # where roles share cores, two left the learner waiting
         )
         steps = learn(
             learner=learner,

@@ -14,6 +14,7 @@ import pytest
 
 from launch.config import RunFile, quick
 from launch.main import main, usage
+from sim.bank import VERSION
 
 TINY = ("--scenes.train", "2", "--scenes.held-out", "2")
 
@@ -130,9 +131,10 @@ def test_a_bank_of_another_version(
     bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = tmp_path / "old.bank"
-    old.write_bytes(bank.read_bytes().replace(b'"version": 1', b'"version": 7', 1))
+    ours, theirs = (f'"version": {number}'.encode() for number in (VERSION, 9))
+    old.write_bytes(bank.read_bytes().replace(ours, theirs, 1))
     line = refusal(capsys, "evaluate", "--agent", "expert", "--scenes", old)
-    assert "has version 7" in line
+    assert "has version 9" in line
 
 
 def test_a_truncated_bank(
