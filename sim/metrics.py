@@ -182,7 +182,8 @@ def route_position(
     spacing = bank.route_spacing[scene, index]
     start, along = route[:-1], route[1:] - route[:-1]
     offset_x, offset_y = x - start[:, 0], y - start[:, 1]
-    squared = jnp.maximum((along**2).sum(-1), 1e-12)
+    # No reduction: over two terms it would round differently from batch to batch.
+    squared = jnp.maximum(along[:, 0] ** 2 + along[:, 1] ** 2, 1e-12)
     t = (offset_x * along[:, 0] + offset_y * along[:, 1]) / squared
     t = jnp.clip(t, 0.0, 1.0)
     distance = (offset_x - t * along[:, 0]) ** 2 + (offset_y - t * along[:, 1]) ** 2
