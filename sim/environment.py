@@ -5,10 +5,11 @@ Written for one scene; `jax.vmap` over scenes outside. A scene starts at the ban
 the action space's dynamics and all others to where they were recorded.
 
 Reward of the step from t-1 to t (Gulino et al., 2023, main text): minus overlap minus
-off-road at t. `progress` (off in the paper's preset) adds metres gained along the
-logged route, up to its end, times 1 - (aside / `progress_width`)^2 while that is above
-0, `aside` being the distance from the route: the paper's reward alone is satisfied by
-standing still.
+off-road at t. `progress` (off in the paper's preset) adds the metres gained along the
+logged route, since the paper's reward alone is satisfied by standing still. Metres
+ahead of where the log was at that step do not count, or speeding and running red
+lights would pay; the others count 1 - (aside / `progress_width`)^2, not below 0, where
+`aside` is the distance from the route.
 
 Terminated is what ends the return (a failure, where `terminate` says so); truncated is
 the recording's end, after which there was more to come: only the first has discount 0.
@@ -157,8 +158,11 @@ def advance(
     position = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
         bank, state.scene, state.controlled, now[:, 0], now[:, 1]
     )
-    end = bank.route_end[state.scene, state.controlled]
-    gained = jnp.minimum(position.along, end) - jnp.minimum(state.along, end)
+    gained = jnp.minimum(
+        position.along, _logged_along(bank, state.scene, step_t, state.controlled)
+    ) - jnp.minimum(
+        state.along, _logged_along(bank, state.scene, state.step, state.controlled)
+    )
     near = jnp.maximum(1.0 - (position.aside / config.progress_width) ** 2, 0.0)
     reward = (
         config.progress * gained * near
@@ -182,6 +186,20 @@ def advance(
         truncated=last | ~valid.any(),
         valid=valid,
     )
+
+
+def _logged_along(
+    bank: Bank,
+    scene: Int[Array, ""],
+    step: Int[Array, ""],
+    controlled: Int[Array, " controlled"],
+) -> Float[Array, " controlled"]:
+    """How far the log was along its routes at a step [m]."""
+    row = bank.log[scene, step, controlled]
+    position = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
+        bank, scene, controlled, row[:, 0], row[:, 1]
+    )
+    return position.along
 
 
 def failures(
