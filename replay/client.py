@@ -152,7 +152,10 @@ class Sampler:
         """Tops up the queries in flight, unless it is too early to try again."""
         if time.monotonic() < self._retry_at:
             return
-        while self._outstanding < self._in_flight:
+        # What has come and was not taken counts too: a learner slower than the service
+        # would otherwise work through an ever longer queue of old draws.
+        kept = -(-len(self._ready) // self._batches)
+        while self._outstanding + kept < self._in_flight:
             updates, self._updates = self._updates, []
             request = _Request(updates, self._events)
             message = SampleRequest(
