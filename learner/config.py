@@ -40,6 +40,10 @@ class LearnerConfig:
     max_gradient_norm: float = 0.0
     """Gradients are scaled down to this norm over all parameters; 0 means never."""
 
+    average_updates: int = 0
+    """The policy acts with the mean of the weights over about this many updates
+    (exponential); 0, the paper's, is the network itself."""
+
     loss: Literal["torchrl", "plain"] = "torchrl"
     """Whose arithmetic: torchrl's `DQNLoss`, or the same in plain torch, which is
     faster and equal to it by test."""
@@ -72,8 +76,12 @@ class LearnerConfig:
                 raise ValueError(f"{name}={getattr(self, name)} must be above 0")
         if not 0 <= self.discount <= 1:
             raise ValueError(f"discount={self.discount} must be within 0 and 1")
-        if self.importance_exponent < 0 or self.max_gradient_norm < 0:
+        if (
+            min(self.importance_exponent, self.max_gradient_norm, self.average_updates)
+            < 0
+        ):
             raise ValueError(
                 f"importance_exponent={self.importance_exponent} and "
-                f"max_gradient_norm={self.max_gradient_norm} must not be negative"
+                f"max_gradient_norm={self.max_gradient_norm} and average_updates="
+                f"{self.average_updates} must not be negative"
             )
