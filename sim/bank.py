@@ -7,12 +7,13 @@ origin, kept in double precision, is subtracted before anything is rounded to fl
 
 File: the magic, the header's length (uint64, little-endian), the header (JSON: version,
 sizes, scenario ids, origins, one {name, dtype, shape, offset} per array, the SHA-256 of
-the data), then the arrays, each at a multiple of `ALIGNMENT` so that JAX on a CPU can
-use the mapped pages as they are.
+all this and of the data), then the arrays, each at a multiple of `ALIGNMENT` so that
+JAX on a CPU can use the mapped pages as they are.
 """
 
 import hashlib
 import json
+import math
 import mmap
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -73,7 +74,7 @@ class BankFile:
     """An opened bank. `arrays` are read-only views of the mapped file."""
 
     path: Path
-    content_hash: str  # SHA-256 of the data, hexadecimal
+    content_hash: str  # SHA-256 of all that it says, hexadecimal
     scenario_ids: tuple[str, ...]
     origins: tuple[tuple[float, float, float], ...]  # m, map frame
     dt: float  # s
@@ -136,26 +137,21 @@ def write_bank(
 def _write_file(
     path: Path, arrays: dict[str, np.ndarray], description: dict[str, Any]
 ) -> None:
-    digest = hashlib.sha256()
-    entries, offset = [], 0
-    for name in Bank._fields:
-        data = np.ascontiguousarray(arrays[name])
-        arrays[name] = data
-        digest.update(memoryview(data).cast("B") if data.size else b"")
+    arrays = {name: np.ascontiguousarray(arrays[name]) for name in Bank._fields}
+    entries: list[dict[str, Any]] = []
+    places: list[int] = []
+    end = 0
+    for name, data in arrays.items():
         entries.append(
-            {
-                "name": name,
-                "dtype": data.dtype.str,
-                "shape": data.shape,
-                "offset": offset,
-            }
+            {"name": name, "dtype": data.dtype.str, "shape": data.shape, "offset": end}
         )
-        offset += _aligned(data.nbytes)
+        places.append(end)
+        end += _aligned(data.nbytes)
     header = json.dumps(
         {
             "version": VERSION,
-            "sha256": digest.hexdigest(),
-            "bytes": offset,
+            "sha256": _digest(arrays, description),
+            "bytes": end,
             "arrays": entries,
             **description,
         }
@@ -164,18 +160,37 @@ def _write_file(
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "wb") as file:
-            file.write(MAGIC + len(header).to_bytes(8, "little") + header)
-            for entry in entries:
-                file.seek(start + entry["offset"])
-                arrays[entry["name"]].tofile(file)
-            file.truncate(start + offset)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+        try:
+            with open(temporary, "wb") as file:
+                file.write(MAGIC + len(header).to_bytes(8, "little") + header)
+                for place, data in zip(places, arrays.values(), strict=True):
+                    file.seek(start + place)
+                    file.write(_bytes(data))
+                file.truncate(start + end)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise BankError(f"cannot write bank {path}: {error.strerror}") from error
+
+
+def _bytes(data: np.ndarray) -> memoryview:
+    """The array's memory; a view of no element cannot be cast."""
+    return data.data.cast("B") if data.size else memoryview(b"")
+
+
+def _digest(arrays: dict[str, np.ndarray], description: dict[str, Any]) -> str:
+    """SHA-256 of all that a bank says: names, types, shapes, description and data."""
+    shapes = [
+        (name, arrays[name].dtype.str, arrays[name].shape) for name in Bank._fields
+    ]
+    text = json.dumps([VERSION, shapes, sorted(description.items())])
+    digest = hashlib.sha256(text.encode())
+    for name in Bank._fields:
+        digest.update(_bytes(arrays[name]))
+    return digest.hexdigest()
 
 
 def open_bank(path: Path) -> BankFile:
@@ -189,22 +204,38 @@ def open_bank(path: Path) -> BankFile:
             f"cannot open bank {path}: {reason}; make one with `slipstream scenes`"
         ) from error
     header, start = _read_header(path, mapped)
-    arrays = {}
-    for entry in header["arrays"]:
-        dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
-        count = int(np.prod(shape, dtype=np.int64))
-        flat = np.frombuffer(mapped, dtype, count, start + entry["offset"])
-        arrays[entry["name"]] = flat.reshape(shape)
-    if set(arrays) != set(Bank._fields):
+    try:
+        bank = BankFile(
+            path=path,
+            content_hash=str(header["sha256"]),
+            scenario_ids=tuple(str(name) for name in header["scenario_ids"]),
+            origins=tuple(
+                (float(x), float(y), float(z)) for x, y, z in header["origins"]
+            ),
+            dt=float(header["dt"]),
+            arrays={
+                str(entry["name"]): _array(mapped, start, entry)
+                for entry in header["arrays"]
+            },
+        )
+    except (ValueError, KeyError, TypeError, OverflowError, SyntaxError) as error:
+        raise _broken(path) from error
+    if set(bank.arrays) != set(Bank._fields):
         raise BankError(f"bank {path} lacks arrays; convert its scenes again")
-    return BankFile(
-        path=path,
-        content_hash=header["sha256"],
-        scenario_ids=tuple(header["scenario_ids"]),
-        origins=tuple((x, y, z) for x, y, z in header["origins"]),
-        dt=float(header["dt"]),
-        arrays=arrays,
-    )
+    return bank
+
+
+def _array(mapped: mmap.mmap, start: int, entry: dict[str, Any]) -> np.ndarray:
+    """A view of one array of the file."""
+    dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
+    if entry["offset"] < 0 or any(length < 0 for length in shape):
+        raise ValueError("an array outside of the data")
+    flat = np.frombuffer(mapped, dtype, math.prod(shape), start + entry["offset"])
+    return flat.reshape(shape)
+
+
+def _broken(path: Path) -> BankError:
+    return BankError(f"bank {path}: broken header; convert its scenes again")
 
 
 def _read_header(path: Path, mapped: mmap.mmap) -> tuple[dict[str, Any], int]:
@@ -219,34 +250,32 @@ def _read_header(path: Path, mapped: mmap.mmap) -> tuple[dict[str, Any], int]:
         )
     try:
         header = json.loads(mapped[16 : 16 + length])
-        version = header["version"]
+        version, size = header["version"], int(header["bytes"])
     except (ValueError, KeyError, TypeError) as error:
-        raise BankError(
-            f"bank {path}: broken header; convert its scenes again"
-        ) from error
+        raise _broken(path) from error
     if version != VERSION:
         raise BankError(
             f"bank {path} has version {version}, this program reads {VERSION}; "
             "convert its scenes again"
         )
     start = _aligned(16 + length)
-    if len(mapped) != start + header["bytes"]:
+    if len(mapped) != start + size:
         raise BankError(
-            f"bank {path} is truncated: {len(mapped)} bytes of "
-            f"{start + header['bytes']}; convert its scenes again"
+            f"bank {path} is truncated: {len(mapped)} bytes of {start + size}; "
+            "convert its scenes again"
         )
     return header, start
 
 
 def verify(file: BankFile) -> None:
     """Reads every byte and compares the hash; BankError if they differ."""
-    digest = hashlib.sha256()
-    for name in Bank._fields:
-        data = file.arrays[name]
-        digest.update(memoryview(data).cast("B") if data.size else b"")
-    if digest.hexdigest() != file.content_hash:
+    found = _digest(
+        file.arrays,
+        {"scenario_ids": file.scenario_ids, "origins": file.origins, "dt": file.dt},
+    )
+    if found != file.content_hash:
         raise BankError(
-            f"bank {file.path} is damaged: its data hash to {digest.hexdigest()}, its "
+            f"bank {file.path} is damaged: its content hashes to {found}, its "
             f"header says {file.content_hash}; convert its scenes again"
         )
 

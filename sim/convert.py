@@ -189,7 +189,7 @@ def _knots(
 
 
 def _candidate_rows(
-    state: Int[np.ndarray, " fine"], candidates: list[Int[np.ndarray, " edges"]]
+    state: Int[np.ndarray, " fine"], candidates: list[Int[np.ndarray, " _"]]
 ) -> tuple[Int[np.ndarray, " fine"], Int[np.ndarray, "mixed width"]]:
     """A row of candidates per mixed fine cell, and each fine cell's row or verdict.
 

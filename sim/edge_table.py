@@ -19,6 +19,7 @@ from sim.tables import CELL, EDGE_CELL, FINE, Grid
 BELOW, ABOVE = 0.5, 3.0  # m; a box's centre is 0.5 to 2 m above the road
 NEARBY = 3  # cells: road points this near to a cell set its range of heights
 LEVELS = (32, 8, 1)  # sides of the squares that `edge_table` decides, in fine cells
+CLOSED = 1e-3  # m between the ends of an edge that is a ring
 HEIGHT_WEIGHT = 2.0  # the benchmark's: a bridge is not the road below
 
 DRIVABLE = -1  # every point of the cell is on the drivable side
@@ -64,7 +65,8 @@ def edges_of(roads: tuple[Polyline, ...]) -> Edges:
         if len(points) < 2:
             continue
         steps = np.diff(points, axis=0)
-        closed = len(points) > 3 and np.allclose(points[0], points[-1])
+        gap = np.hypot.reduce(points[0] - points[-1])
+        closed = len(points) > 3 and gap < CLOSED
         before, after = np.roll(steps, 1, 0), np.roll(steps, -1, 0)
         if not closed:
             before[0], after[-1] = steps[0], steps[-1]
@@ -89,7 +91,7 @@ def _without_repeats(
 
 def edge_table(
     grid: Grid, edges: Edges, ground: Float[np.ndarray, "points 3"]
-) -> tuple[Int[np.ndarray, " fine"], list[Int[np.ndarray, " candidates"]]]:
+) -> tuple[Int[np.ndarray, " fine"], list[Int[np.ndarray, " _"]]]:
     """Each fine cell's state (MIXED, ...) and, where it is MIXED, its candidates,
     nearest to its centre first.
 

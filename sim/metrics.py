@@ -1,8 +1,8 @@
 """Metrics of one scene at one step: overlap, off-road, log divergence, feasibility.
 
 Definitions follow the Waymax benchmark (Gulino et al., 2023, sec. 3.4), with boxes at
-their full size. Each function is for one object; batch with `jax.vmap`. `tests/oracle.py`
-holds their brute-force twins.
+their full size. Each function is for one object; batch with `jax.vmap`. The brute-force
+twins are in `tests/oracle.py`.
 """
 
 from typing import NamedTuple
@@ -188,7 +188,9 @@ def route_position(
     t = jnp.clip(t, 0.0, 1.0)
     distance = (offset_x - t * along[:, 0]) ** 2 + (offset_y - t * along[:, 1]) ** 2
     best = jnp.argmin(distance)
-    return RoutePosition((best + t[best]) * spacing, jnp.sqrt(distance[best]))
+    return RoutePosition(
+        (best.astype(jnp.float32) + t[best]) * spacing, jnp.sqrt(distance[best])
+    )
 
 
 def progress(

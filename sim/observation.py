@@ -241,7 +241,7 @@ def observe_batch(
     if alone:
         rows = jax.tree.map(lambda value: jnp.concatenate([value, value]), rows)
     apart = {"inlineable": "false"} if jax.default_backend() == "cpu" else {}
-    with set_xla_metadata(**apart):
+    with set_xla_metadata(**apart):  # type: ignore[no-untyped-call]
         batched = _observe_rows(bank, *rows, config=config)
     return jax.tree.map(lambda value: value[:1], batched) if alone else batched
 

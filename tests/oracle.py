@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from sim.scene import Scene
 
-_CHUNK = 500  # points at a time against all edges, for memory
+_CHUNK = 16  # points at a time against all edges: what a cache holds
 _HEIGHT_WEIGHT = 2.0  # height differences count double in the distance to an edge
 _CLOSED = 1e-3  # m between the ends of an edge that is a ring
 MAX_ACCELERATION = 10.4  # m/s^2
