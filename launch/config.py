@@ -27,6 +27,7 @@ from actors.network import NetworkConfig
 from launch.errors import LaunchError
 from learner.config import LearnerConfig
 from replay.local import ReplayConfig
+from sim.dynamics import ActionConfig
 from sim.environment import EnvironmentConfig
 from sim.observation import ObservationConfig
 
@@ -121,23 +122,34 @@ def quick() -> ExperimentConfig:
     """A run of minutes on two cores."""
     return ExperimentConfig(
         environment=EnvironmentConfig(
-            observation=ObservationConfig(neighbours=8, road_rows=32),
-            progress=0.1,
+            action=ActionConfig(acceleration_bins=5, curvature=0.15, curvature_bins=7),
+            observation=ObservationConfig(neighbours=8, road_rows=32, lights=2),
+            progress=0.02,
             terminate=True,
         ),
-        network=NetworkConfig(
-            width=32, heads=2, latents=4, cross_layers=1, self_layers=1
-        ),
+        network=NetworkConfig(),
         actor=ActorConfig(environments=16, scan_steps=8),
-        replay=ReplayConfig(capacity=200_000, min_size=2_000),
-        learner=LearnerConfig(learning_rate=5e-4, loss="plain", discount=0.95),
-        budget=BudgetConfig(updates=20_000, minutes=4.5),
+        replay=ReplayConfig(capacity=200_000, min_size=2_000, samples_per_insert=4.0),
+        learner=LearnerConfig(
+            learning_rate=5e-4,
+            discount=0.97,
+            target_period=300,
+            average_updates=1_500,
+            max_gradient_norm=10.0,
+            loss="plain",
+        ),
+        budget=BudgetConfig(updates=40_000, minutes=4.5),
+        scenes=ScenesConfig(held_out=100),
     )
 
 
 def paper() -> ExperimentConfig:
-    """The paper's DQN."""
-    return ExperimentConfig()
+    """The paper's DQN; it gives the width of 128, the other sizes are ours."""
+    return ExperimentConfig(
+        network=NetworkConfig(
+            width=128, latents=16, cross_layers=2, self_layers=2, feedforward=4
+        )
+    )
 
 
 PRESETS: Final = {"quick": quick, "paper": paper}
