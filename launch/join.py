@@ -7,6 +7,7 @@ keeps in the user's cache for the next time. A bank of another hash is refused.
 
 import os
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Final, final
 from launch.config import CONFIG, RunFile, read_run
 from launch.errors import LaunchError
 from replay.channels import ControlSubscriber
-from replay.files import fetch_file
+from replay.files import FileError, fetch_file
 from replay.keys import RunKeys
 from replay.session import check_endpoints, open_session
 from sim.bank import BankFile, open_bank
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 TRAIN: Final = "train.bank"
 HELD_OUT: Final = "heldout.bank"
 SCENES: Final = "scenes"
+FETCH_S: Final = 20.0  # after which a file that nobody offers is an error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,8 +70,7 @@ def joined(join: JoinConfig, stop: threading.Event) -> Iterator[Joined]:
         follow(control, stop)
         folder = join.run if join.run is not None else _cache() / join.run_id
         if not (folder / CONFIG).is_file():
-            folder.mkdir(parents=True, exist_ok=True)
-            fetch_file(session, keys, CONFIG, folder / CONFIG)
+            _fetch(session, keys, CONFIG, folder / CONFIG)
         run = read_run(folder)
         if run.run_id != join.run_id:
             raise LaunchError(
@@ -77,6 +78,21 @@ def joined(join: JoinConfig, stop: threading.Event) -> Iterator[Joined]:
                 "another folder with --run"
             )
         yield Joined(session=session, keys=keys, run=run, folder=folder)
+
+
+def _fetch(session: "zenoh.Session", keys: RunKeys, name: str, to: Path) -> None:
+    """Fetches a file; a service that has only begun does not offer it yet."""
+    deadline = time.monotonic() + FETCH_S
+    while True:
+        try:
+            fetch_file(session, keys, name, to)
+            return
+        except FileError:
+            if time.monotonic() > deadline:
+                raise
+            # An answer that nobody gives comes at once, and there is no event for
+            # "somebody offers it now".
+            time.sleep(0.2)
 
 
 def follow(control: ControlSubscriber, stop: threading.Event) -> None:
@@ -95,8 +111,7 @@ def train_bank(place: Joined) -> BankFile:
     if not path.is_file():
         path = _cache() / "banks" / f"{place.run.train_hash}.bank"
     if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fetch_file(place.session, place.keys, TRAIN, path)
+        _fetch(place.session, place.keys, TRAIN, path)
     return check_bank(open_bank(path), place.run.train_hash)
 
 

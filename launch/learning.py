@@ -191,21 +191,25 @@ class Reporter:
         now = time.monotonic()
         if now >= self._status_due:
             self._status_due = now + STATUS_S
-            self._seen |= self._progress.take()
-            self._tell(
-                {
-                    "updates": self._learner.updates,
-                    "elapsed_s": self._progress.elapsed_s,
-                    **self._progress.totals(),
-                    **self._seen,
-                }
-            )
+            self.tell()
         if now >= self._curves_due and self._seen:
             self._curves_due = now + self._config.report.curves_s
             self.write_curves()
         if now >= self._checkpoint_due:
             self._checkpoint_due = now + self._config.report.checkpoint_s
             self.save()
+
+    def tell(self) -> None:
+        """Says how far it is."""
+        self._seen |= self._progress.take()
+        self._tell(
+            {
+                "updates": self._learner.updates,
+                "elapsed_s": self._progress.elapsed_s,
+                **self._progress.totals(),
+                **self._seen,
+            }
+        )
 
     def write_curves(self) -> None:
         """One row of what is known now."""
@@ -223,8 +227,8 @@ class Reporter:
         )
 
     def close(self) -> None:
-        """The last row and the last checkpoint."""
-        self._seen |= self._progress.take()
+        """The last word, the last row and the last checkpoint."""
+        self.tell()
         if self._seen:
             self.write_curves()
         self.save()

@@ -54,13 +54,14 @@ def replay_role(join: JoinConfig, stop: threading.Event) -> None:
     keys = RunKeys(join.run_id)
     # The port answers before torch is loaded: the other roles start meanwhile.
     with open_session(connect=join.connect, listen=join.listen, router=True) as session:
-        from replay.server import ReplayServer
-
-        follow(ControlSubscriber(session, keys), stop)
+        control = ControlSubscriber(session, keys)
+        follow(control, stop)
         scenes = join.run / SCENES
         files = {name: scenes / name for name in (TRAIN, HELD_OUT)}
         files[CONFIG] = join.run / CONFIG
-        FileServer(session=session, keys=keys, files=files)
+        offered = FileServer(session=session, keys=keys, files=files)
+        from replay.server import ReplayServer
+
         ReplayServer(
             session=session,
             keys=keys,
@@ -68,6 +69,8 @@ def replay_role(join: JoinConfig, stop: threading.Event) -> None:
             config=run.config.replay,
             seed=run.config.seed,
         ).run(stop)
+        offered.close()
+        control.close()
 
 
 @dataclass(frozen=True)

@@ -211,6 +211,8 @@ def hosted(folder: Path, grace_s: float) -> Iterator[tuple[psutil.Process, list[
         [sys.executable, "-c", HOST, str(folder), json.dumps(STUBBORN), str(grace_s)],
         stdout=subprocess.PIPE,
         start_new_session=True,
+        # A shell's background job has Ctrl-C ignored, and its children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     logs = [folder / f"role{index}.log" for index in range(3)]
     try:
