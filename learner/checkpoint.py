@@ -167,7 +167,7 @@ def _policy_bytes(learner: Learner, extra: Mapping[str, Any]) -> bytes:
     buffer = io.BytesIO()
     np.savez(
         buffer,
-        vector=learner.vector(),
+        vector=learner.policy_vector(),
         layout_hash=np.array(layout_hash(learner.layout)),
         network=np.array(json.dumps(asdict(learner.network_config))),
         sizes=np.array(json.dumps(learner.sizes._asdict())),

@@ -41,8 +41,8 @@ class LearnerConfig:
     """Gradients are scaled down to this norm over all parameters; 0 means never."""
 
     average_updates: int = 0
-    """The policy acts with the mean of the weights over about this many updates
-    (exponential); 0, the paper's, is the network itself."""
+    """The trained policy has the mean of the weights over about this many updates
+    (exponential); 0, the paper's, is the network itself. Actors take the network."""
 
     loss: Literal["torchrl", "plain"] = "torchrl"
     """Whose arithmetic: torchrl's `DQNLoss`, or the same in plain torch, which is

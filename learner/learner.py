@@ -9,7 +9,8 @@ with probabilities P:
     target := online after every `target_period`-th update
 
 A policy read off the last weights alone changes from update to update: with
-`average_updates` it is read off their exponential mean (Polyak and Juditsky, 1992).
+`average_updates` the trained policy is read off their exponential mean (Polyak and
+Juditsky, 1992). Actors take the last weights: what they do wrong is what is to learn.
 
 `discount_t` of a row is the environment's: 1, or 0 if and only if s_t is terminal;
 it is multiplied by the configured discount here. Nothing in an update is random, so
@@ -98,7 +99,11 @@ class Learner:
         return parameter_layout(self.network_config, self.sizes, self.actions)
 
     def vector(self) -> Float[np.ndarray, " parameters"]:
-        """A copy of the policy's weights as one vector, for the actors."""
+        """A copy of the network's weights as one vector, for the actors."""
+        return to_vector(self.network)
+
+    def policy_vector(self) -> Float[np.ndarray, " parameters"]:
+        """A copy of the weights to drive with: averaged, where that is configured."""
         averaged = self.config.average_updates > 0
         return to_vector(self.average if averaged else self.network)
 

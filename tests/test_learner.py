@@ -225,3 +225,18 @@ def test_the_loop_publishes_and_returns_priorities():
         np.testing.assert_array_equal(ids, draw.ids)
         np.testing.assert_array_equal(values, result.priorities)
     assert all(turn.updated_s > 0 for turn in turns if turn is not None)
+
+
+@pytest.mark.parametrize("average_updates", [0, 4])
+def test_the_policy_is_the_mean_of_the_weights_where_that_is_asked_for(
+    average_updates: int,
+) -> None:
+    learner, batches = make_learner(average_updates=average_updates), make_batches()
+    expected = learner.vector()
+    for update in range(1, 8):
+        learner.update(next(batches))
+        # The definition: each update moves the mean by 1/n, n at most the window.
+        share = 1.0 / min(update, average_updates) if average_updates else 1.0
+        expected = expected + share * (learner.vector() - expected)
+    np.testing.assert_allclose(learner.policy_vector(), expected, atol=1e-6)
+    assert (learner.policy_vector() != learner.vector()).any() == (average_updates > 0)
