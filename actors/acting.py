@@ -74,7 +74,7 @@ class Transitions(NamedTuple):
 def epsilons(
     *, actor: int, actors: int, environments: int, lowest: float, highest: float
 ) -> Float[np.ndarray, " environments"]:
-    """Log-spaced over all environments of all actors, this actor's share interleaved."""
+    """Log-spaced over all actors' environments; this actor has every n-th."""
     total = actors * environments
     if total == 1:
         return np.array([highest], np.float32)

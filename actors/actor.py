@@ -57,6 +57,19 @@ class ActorConfig:
             )
 
 
+def exploration(
+    config: ActorConfig, *, actor: int, actors: int
+) -> Float[np.ndarray, " environments"]:
+    """The epsilons of one of the run's actors."""
+    return acting.epsilons(
+        actor=actor,
+        actors=actors,
+        environments=config.environments,
+        lowest=config.epsilon_lowest,
+        highest=config.epsilon_highest,
+    )
+
+
 @runtime_checkable
 class Weights(Protocol):
     """What the weights channel hands over."""
@@ -88,8 +101,8 @@ def run_actor(
     bank: Bank,
     config: ActorConfig,
     acting_config: ActingConfig,
+    epsilon: Float[np.ndarray, " environments"],
     actor: int,
-    actors: int,
     latest: Callable[[], Weights],
     write: Callable[[np.ndarray], object],
     show: Callable[[FrameBatch], object] | None = None,
@@ -101,8 +114,8 @@ def run_actor(
         bank: the scenes.
         config: sizes and exploration.
         acting_config: what is compiled.
+        epsilon: probability of a random action per environment (`acting.epsilons`).
         actor: this actor's number, from 0.
-        actors: how many there are, for the exploration's spacing.
         latest: the newest weights; called between scans.
         write: takes a batch of rows; blocks while the replay holds back.
         show: takes the watched environments' frames, where somebody watches.
@@ -110,15 +123,6 @@ def run_actor(
     start_key, key = jax.random.split(key)
     act = jax.jit(
         functools.partial(acting.act, config=acting_config, watched=config.watched)
-    )
-    epsilon = jnp.asarray(
-        acting.epsilons(
-            actor=actor,
-            actors=actors,
-            environments=config.environments,
-            lowest=config.epsilon_lowest,
-            highest=config.epsilon_highest,
-        )
     )
     running = jax.jit(acting.start, static_argnums=(2, 3))(
         start_key, bank, config.environments, acting_config.environment
@@ -131,7 +135,7 @@ def run_actor(
             version, vector = weights.version, _on_device(weights.vector)
         began = time.perf_counter()
         key, scan_key = jax.random.split(key)
-        running, batch = act(scan_key, bank, vector, running, epsilon)
+        running, batch = act(scan_key, bank, vector, running, jnp.asarray(epsilon))
         transitions: Transitions = jax.device_get(batch)
         acted = time.perf_counter()
         rows = rows_of(transitions, version=version, actor=actor, first=steps)
@@ -140,13 +144,13 @@ def run_actor(
         if show is not None:
             for environment in range(config.watched):
                 show(frames_of(transitions, environment, actor, steps, version))
-        ended = transitions.over
+        ended = np.asarray(transitions.over)
         yield Tick(
             steps=steps,
             version=version,
-            scores=transitions.score[ended],
-            failed=transitions.failed[ended],
-            progress=transitions.progress[ended],
+            scores=np.asarray(transitions.score)[ended],
+            failed=np.asarray(transitions.failed)[ended],
+            progress=np.asarray(transitions.progress)[ended],
             acted_s=acted - began,
             waited_s=time.perf_counter() - acted,
         )

@@ -88,8 +88,8 @@ def read_policy(path: Path) -> Policy:
             named = str(arrays["layout_hash"])
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise PolicyError(
-            f"{file}: cannot be read as a policy ({error}); it is damaged or of another "
-            "version: use another checkpoint"
+            f"{file}: cannot be read as a policy ({error}); it is damaged or of "
+            "another version: use another checkpoint"
         ) from error
     layout = parameter_layout(policy.network, policy.sizes, policy.actions)
     if layout_hash(layout) != named or policy.vector.shape != (

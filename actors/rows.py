@@ -40,11 +40,11 @@ def row_spec(history: int) -> RowSpec:
 class Columns(NamedTuple):
     """The part of a batch of rows that observations are rendered from."""
 
-    scene: Int[Array, " batch"]
-    step: Int[Array, " batch"]
-    controlled: Int[Array, " batch"]
-    states: Float[Array, "batch states 5"]
-    valid: Bool[Array, "batch states"]
+    scene: Int[Array | np.ndarray, " batch"]
+    step: Int[Array | np.ndarray, " batch"]
+    controlled: Int[Array | np.ndarray, " batch"]
+    states: Float[Array | np.ndarray, "batch states 5"]
+    valid: Bool[Array | np.ndarray, "batch states"]
 
 
 def columns_of(rows: np.ndarray) -> Columns:
@@ -61,7 +61,7 @@ def columns_of(rows: np.ndarray) -> Columns:
 def render(
     bank: Bank, columns: Columns, config: ObservationConfig
 ) -> tuple[Observation, Observation]:
-    """The observations s_tm1 and s_t of a batch of rows, in one call of twice the batch.
+    """The observations s_tm1 and s_t of rows, in one call of twice the batch.
 
     Bit for bit those that the actor acted on: `observe_batch` is the same program
     whatever surrounds it (tested).

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from actors.acting import ActingConfig
-from actors.actor import Tick, run_actor
+from actors.actor import Tick, exploration, run_actor
 from actors.frames import FrameBatch, encode_frames
 from actors.network import layout_hash, parameter_layout
 from actors.rows import row_spec
@@ -175,8 +175,8 @@ def _act(place: Joined, actor: int, stop: threading.Event) -> None:
         bank=bank,
         config=config.actor,
         acting_config=acting_config(config),
+        epsilon=exploration(config.actor, actor=actor, actors=config.actors),
         actor=actor,
-        actors=config.actors,
         latest=lambda: subscriber.latest() or first,
         write=write,
         show=show,

@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from actors.actor import Tick, Weights, run_actor
+from actors.actor import Tick, Weights, exploration, run_actor
 from actors.network import layout_hash
 from actors.rows import row_spec
 from launch.config import ExperimentConfig, RunFile
@@ -78,8 +78,8 @@ def _actors(
             bank=bank,
             config=config.actor,
             acting_config=acting_config(config),
+            epsilon=exploration(config.actor, actor=actor, actors=config.actors),
             actor=actor,
-            actors=config.actors,
             latest=lambda: weights[0],
             write=replay.insert,
         )

@@ -1,1 +1,1 @@
-"""The simulator: scenes, dynamics, metrics, observations, agents. JAX and numpy only."""
+"""The simulator: scenes, dynamics, metrics, observations, agents. No torch."""

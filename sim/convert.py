@@ -216,8 +216,8 @@ def _nested(
     """
     side = tables.FINE
     across, along = fine.shape[0] // side, fine.shape[1] // side
-    parts = fine.reshape(across, side, along, side).transpose(0, 2, 1, 3)
-    parts = parts.reshape(across * along, side * side)
+    squares = fine.reshape(across, side, along, side).transpose(0, 2, 1, 3)
+    parts = squares.reshape(across * along, side * side)
     cells = parts[:, 0].copy()
     mixed = np.flatnonzero((parts[:, :1] != parts).any(1) | (cells >= 0))
     cells[mixed] = np.arange(len(mixed))

@@ -95,8 +95,9 @@ def edge_table(
     """Each fine cell's state (MIXED, ...) and, where it is MIXED, its candidates,
     nearest to its centre first.
 
-    Fine cell (i, j) of `grid.fine` covers `EDGE_CELL` metres a side. Squares of `LEVELS`
-    narrow the edges down from large to small; one that all its edges agree on is done.
+    Fine cell (i, j) of `grid.fine` covers `EDGE_CELL` metres a side. Squares of
+    `LEVELS` narrow the edges down from large to small; one that all its edges agree on
+    is done.
     """
     fine = grid.fine
     state = np.full(fine.shape, DRIVABLE, np.int32)

@@ -120,10 +120,8 @@ def _legs(rng: np.random.Generator, radius: float) -> list[_Leg]:
     """Two roads that cross at 75 to 105 degrees."""
     lane = rng.uniform(3.4, 3.7)
     profiles = []
-    for road in range(2):
-        count = int(
-            rng.choice([1, 2, 3], p=[0.35, 0.5, 0.15] if road else [0.2, 0.5, 0.3])
-        )
+    for shares in ([0.2, 0.5, 0.3], [0.35, 0.5, 0.15]):
+        count = int(rng.choice([1, 2, 3], p=shares))
         median = rng.uniform(1.5, 4.0) if count > 1 and rng.random() < 0.4 else 0.0
         profiles.append(
             Profile(forward=count, oncoming=count, lane=lane, median=median)
