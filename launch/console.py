@@ -178,7 +178,7 @@ class RunConsole:
     async def last_look(self) -> None:
         """The final counters, while the replay service is still up."""
         if self._session is not None:
-            await self._look()
+            await self._look(last=True)
 
     async def _connect(self) -> "zenoh.Session":
         while True:
@@ -206,7 +206,7 @@ class RunConsole:
                 print(line_of(self.figures), flush=True)
             await asyncio.sleep(_TERMINAL_S)
 
-    async def _look(self) -> None:
+    async def _look(self, last: bool = False) -> None:
         assert self._session is not None and self._statuses is not None
         try:
             self._stats = await asyncio.to_thread(
@@ -220,7 +220,8 @@ class RunConsole:
         figures["steps_per_s"] = self._rate.add(now, figures["steps"])
         figures["looked_s"] = now
         figures["restarts"] = sum(self._supervisor.restarts.values())
-        figures["cpu"] = self._processors()
+        # At the end roles are gone and the time since the last look is short.
+        figures["cpu"] = self.figures.get("cpu", {}) if last else self._processors()
         figures["roles"] = {name: dict(values) for name, (_, values) in roles.items()}
         self.figures = figures
         self._on_look(figures)

@@ -69,7 +69,7 @@ def test_a_person_without_a_command_gets_the_list(
         (["train", "dqn", "--spped", "1"], "--spped"),
         (["train", "dqn", "--actors", "many"], "many"),
         (["train", "dqn", "--actors", "0"], "actors=0 must be at least 1"),
-        (["train", "dqn", "--network.width", "33"], "heads=2 must divide width=33"),
+        (["train", "dqn", "--network.width", "33"], "must divide width=33"),
         (["train", "dqn", "--envs", "512"], "would deadlock"),
         (["train", "dqn", "--resume", "--run", "nowhere"], "no run to resume"),
         (["train", "dqn", "--run", "new", "--scenes", "nowhere"], "no such file"),
@@ -202,16 +202,20 @@ def test_a_checkpoint_of_another_network(
 def test_evaluation_counts_every_scene(
     bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "a.json"
-    words = ("evaluate", "--agent", "log", "--objects", "all", "--scenes", bank)
-    assert main([str(word) for word in (*words, "--json", out)]) == 0
-    assert "failures" in capsys.readouterr().out
-    result = json.loads(out.read_text())
-    assert result["agent"] == "log" and len(result["scenes"]) == 2
-    for scene in result["scenes"]:
-        assert scene["valid"] >= scene["objects"] > 0
-        # The generator's traffic collides with nothing and stays on the road.
-        assert scene["overlap"] == scene["offroad"] == 0
+    rows = {}
+    for objects in ("sdc", "all"):
+        out = tmp_path / f"{objects}.json"
+        words = ("evaluate", "--agent", "log", "--objects", objects, "--scenes", bank)
+        assert main([str(word) for word in (*words, "--json", out)]) == 0
+        assert "failures" in capsys.readouterr().out
+        result = json.loads(out.read_text())
+        assert result["agent"] == "log" and len(result["scenes"]) == 2
+        rows[objects] = result["scenes"]
+    for ours, every in zip(rows["sdc"], rows["all"], strict=True):
+        assert ours["id"] == every["id"] and ours["objects"] == 1
+        # The generator's cars collide with nothing and stay on the road.
+        assert ours["overlap"] == ours["offroad"] == every["overlap"] == 0
+        assert every["valid"] > ours["valid"] and every["objects"] > 1
 
 
 def test_info_tells_a_bank(bank: Path, capsys: pytest.CaptureFixture[str]) -> None:
