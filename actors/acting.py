@@ -36,6 +36,8 @@ class ActingConfig:
     """The network's sizes."""
     scan_steps: int
     """Steps per call (K)."""
+    watched: int
+    """Environments, the first ones, whose Q-values are handed out."""
 
     @property
     def sizes(self) -> ObservationSizes:
@@ -102,12 +104,11 @@ def act(
     running: Running,
     epsilon: Float[Array, " environments"],
     config: ActingConfig,
-    watched: int,
 ) -> tuple[Running, Transitions]:
-    """K steps of all environments. Compile with `config` and `watched` static."""
+    """K steps of all environments. Compile with `config` static."""
 
     def one(carry: Running, step_key: PRNGKeyArray) -> tuple[Running, Transitions]:
-        return _step(step_key, bank, vector, carry, epsilon, config, watched)
+        return _step(step_key, bank, vector, carry, epsilon, config)
 
     return jax.lax.scan(one, running, jax.random.split(key, config.scan_steps))
 
@@ -119,7 +120,6 @@ def _step(
     running: Running,
     epsilon: Float[Array, " environments"],
     config: ActingConfig,
-    watched: int,
 ) -> tuple[Running, Transitions]:
     state, environment = running.state, config.environment
     explore_key, random_key, reset_key = jax.random.split(key, 3)
@@ -169,7 +169,7 @@ def _step(
         score=score,
         failed=failed,
         progress=progress,
-        q_values=q_values[:watched],
+        q_values=q_values[: config.watched],
     )
     after = Running(
         state=fresh,

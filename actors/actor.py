@@ -99,8 +99,7 @@ def run_actor(
     *,
     key: PRNGKeyArray,
     bank: Bank,
-    config: ActorConfig,
-    acting_config: ActingConfig,
+    config: ActingConfig,
     epsilon: Float[np.ndarray, " environments"],
     actor: int,
     latest: Callable[[], Weights],
@@ -112,8 +111,7 @@ def run_actor(
     Args:
         key: of this actor and of this start of it.
         bank: the scenes.
-        config: sizes and exploration.
-        acting_config: what is compiled.
+        config: what is compiled.
         epsilon: probability of a random action per environment (`acting.epsilons`).
         actor: this actor's number, from 0.
         latest: the newest weights; called between scans.
@@ -121,11 +119,9 @@ def run_actor(
         show: takes the watched environments' frames, where somebody watches.
     """
     start_key, key = jax.random.split(key)
-    act = jax.jit(
-        functools.partial(acting.act, config=acting_config, watched=config.watched)
-    )
+    act = jax.jit(functools.partial(acting.act, config=config))
     running = jax.jit(acting.start, static_argnums=(2, 3))(
-        start_key, bank, config.environments, acting_config.environment
+        start_key, bank, len(epsilon), config.environment
     )
     version, vector = -1, jnp.zeros(0)
     steps = 0

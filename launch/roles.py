@@ -117,6 +117,7 @@ def acting_config(config: ExperimentConfig) -> ActingConfig:
         environment=config.environment,
         network=config.network,
         scan_steps=config.actor.scan_steps,
+        watched=config.actor.watched,
     )
 
 
@@ -173,8 +174,7 @@ def _act(place: Joined, actor: int, stop: threading.Event) -> None:
     ticks = run_actor(
         key=jax.random.fold_in(key, epoch % 2**31),
         bank=bank,
-        config=config.actor,
-        acting_config=acting_config(config),
+        config=acting_config(config),
         epsilon=exploration(config.actor, actor=actor, actors=config.actors),
         actor=actor,
         latest=lambda: subscriber.latest() or first,

@@ -76,8 +76,7 @@ def _actors(
         run_actor(
             key=jax.random.fold_in(key, actor),
             bank=bank,
-            config=config.actor,
-            acting_config=acting_config(config),
+            config=acting_config(config),
             epsilon=exploration(config.actor, actor=actor, actors=config.actors),
             actor=actor,
             latest=lambda: weights[0],
