@@ -198,10 +198,11 @@ class RunConsole:
                 await asyncio.sleep(_TERMINAL_S)
 
     async def _plain(self) -> None:
+        print("the processes start and compile", flush=True)
         due = time.monotonic() + _PLAIN_S
         while True:
             await self._look()
-            if time.monotonic() >= due:
+            if time.monotonic() >= due and self.figures["steps"]:
                 due = time.monotonic() + _PLAIN_S
                 print(line_of(self.figures), flush=True)
             await asyncio.sleep(_TERMINAL_S)

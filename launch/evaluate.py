@@ -51,6 +51,11 @@ COLUMNS: Final = (
 )
 
 
+def printer() -> Console:
+    """Standard output; wide enough for the table where it is no terminal."""
+    return Console(width=None if sys.stdout.isatty() else 110)
+
+
 def summary(evaluation: Evaluation) -> dict[str, float | int | str | None]:
     """The figures of an agent; JSON has no NaN, so what there is none of is null."""
     figures: dict[str, float] = {
@@ -197,7 +202,7 @@ def evaluate_command(options: EvaluateConfig) -> int:
     if options.json:
         write_atomically(Path(options.json), (text + "\n").encode())
     names = ", ".join(options.scenes)
-    Console().print(table_of([result], f"{names}: {bank.scenes} scenes"))
+    printer().print(table_of([result], f"{names}: {bank.scenes} scenes"))
     return 0
 
 
@@ -249,7 +254,7 @@ def report(
 ) -> list[Evaluation]:
     """Writes a run's evaluation.json, .md and .rrd, and prints its table."""
     results = compare(config, policy_path, bank)
-    title = f"{bank.scenes} held-out scenes"
+    title = f"{bank.scenes} held-out scene{'s' if bank.scenes > 1 else ''}"
     content = {
         "agents": [summary(result) for result in results],
         "scenes": {result.agent: scenes_json(result) for result in results},
@@ -258,8 +263,7 @@ def report(
     write_atomically(folder / "evaluation.json", text.encode())
     markdown = markdown_of(results, title)
     write_atomically(folder / "evaluation.md", markdown.encode())
-    sys.stdout.flush()
-    Console().print(table_of(results, title))
+    printer().print(table_of(results, title))
     return results
 
 
