@@ -60,6 +60,13 @@ class TrainConfig:
     """Runs all roles in this process, in a fixed order: same seed, same losses."""
     view: bool = False
     """Shows the run live in the browser."""
+    listen: tuple[str, ...] = ()
+    """Further endpoints at which roles on other machines find the run, e.g.
+    tcp/0.0.0.0:7447."""
+    remote_actors: int = 0
+    """Of the actors, the last ones run elsewhere: they are not started here."""
+    insecure: bool = False
+    """Allows --listen on addresses other than loopback; nothing is encrypted."""
     config: Annotated[ExperimentConfig, tyro.conf.arg(name="")] = field(
         default_factory=quick
     )
@@ -137,8 +144,52 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def roles_of(folder: Path, run: RunFile, port: int, *, view: bool) -> list[Role]:
-    """The processes of a run."""
+@dataclass(frozen=True, kw_only=True)
+class Placement:
+    """Which processes are started here, and where others find them."""
+
+    view: bool = False
+    listen: tuple[str, ...] = ()
+    remote_actors: int = 0
+    insecure: bool = False
+
+
+def placement_of(options: TrainConfig, run: RunFile) -> Placement:
+    """The command's, checked."""
+    from replay.session import check_endpoints
+
+    check_endpoints(options.listen, options.insecure)
+    if not 0 <= options.remote_actors <= run.config.actors:
+        raise LaunchError(
+            f"--remote-actors {options.remote_actors}: the run has "
+            f"{run.config.actors} actors in all; set --actors"
+        )
+    if options.remote_actors and not options.listen:
+        raise LaunchError(
+            f"--remote-actors {options.remote_actors}: name the endpoint that they "
+            "connect to by --listen tcp/HOST:PORT"
+        )
+    return Placement(
+        view=options.view,
+        listen=options.listen,
+        remote_actors=options.remote_actors,
+        insecure=options.insecure,
+    )
+
+
+def joining_lines(run: RunFile, placement: Placement) -> list[str]:
+    """What to type on the other machines."""
+    local = run.config.actors - placement.remote_actors
+    insecure = " --insecure" if placement.insecure else ""
+    return [
+        f"actor {actor} joins from another machine by: slipstream actor --run-id "
+        f"{run.run_id} --connect {placement.listen[0]}{insecure} --actor {actor}"
+        for actor in range(local, run.config.actors)
+    ]
+
+
+def roles_of(folder: Path, run: RunFile, port: int, placement: Placement) -> list[Role]:
+    """The processes of a run that are started here."""
     endpoint = f"tcp/127.0.0.1:{port}"
     command = (sys.executable, "-m", "launch")
     common = ("--run-id", run.run_id, "--run", str(folder))
@@ -146,7 +197,11 @@ def roles_of(folder: Path, run: RunFile, port: int, *, view: bool) -> list[Role]
     roles = [
         Role(
             name="replay",
-            command=(*command, "replay", *common, "--listen", endpoint),
+            command=(
+                *(*command, "replay", *common, "--listen", endpoint),
+                *placement.listen,
+                *(("--insecure",) if placement.insecure else ()),
+            ),
             critical=True,
             port=port,
         ),
@@ -156,14 +211,14 @@ def roles_of(folder: Path, run: RunFile, port: int, *, view: bool) -> list[Role]
             finishes=True,
         ),
     ]
-    for actor in range(run.config.actors):
+    for actor in range(run.config.actors - placement.remote_actors):
         roles.append(
             Role(
                 name=f"actor-{actor}",
                 command=(*command, "actor", *client, "--actor", str(actor)),
             )
         )
-    if view:
+    if placement.view:
         roles.append(Role(name="viewer", command=(*command, "viewer", *client)))
     return roles
 
@@ -183,11 +238,22 @@ def announced(folder: Path, run: RunFile, endpoint: str) -> Iterator[None]:
         (folder / ENDPOINT).unlink(missing_ok=True)
 
 
+async def _tell_page(log: Path, console: Console) -> None:
+    """Passes on where the viewer says that it can be opened."""
+    while True:
+        lines = log.read_text().splitlines() if log.exists() else []
+        for line in lines:
+            if line.startswith("open "):
+                console.print(line, highlight=False, soft_wrap=True)
+                return
+        await asyncio.sleep(0.5)
+
+
 async def supervise(
     folder: Path,
     run: RunFile,
     *,
-    view: bool = False,
+    placement: Placement | None = None,
     on_look: Callable[[Mapping[str, Any]], None] = lambda figures: None,
 ) -> Result:
     """Runs the processes of a run to its end, with the console beside them.
@@ -201,7 +267,7 @@ async def supervise(
     endpoint = f"tcp/127.0.0.1:{port}"
     console = Console()
     supervisor = Supervisor(
-        roles=roles_of(folder, run, port, view=view),
+        roles=roles_of(folder, run, port, placement or Placement()),
         log_folder=folder / LOGS,
         on_event=lambda line: console.print(line, highlight=False),
         before_stop=lambda: shown.last_look(),
@@ -216,12 +282,16 @@ async def supervise(
         on_look=on_look,
     )
     with announced(folder, run, endpoint):
-        following = asyncio.create_task(shown.follow())
+        beside = [asyncio.create_task(shown.follow())]
+        if view:
+            log = folder / LOGS / "viewer.log"
+            beside.append(asyncio.create_task(_tell_page(log, console)))
         try:
             result = await supervisor.run()
         finally:
-            following.cancel()
-            await asyncio.gather(following, return_exceptions=True)
+            for task in beside:
+                task.cancel()
+            await asyncio.gather(*beside, return_exceptions=True)
         shown.write(result.outcome.value, result.reason)
     return result
 
@@ -235,7 +305,10 @@ def train_command(options: TrainConfig) -> int:
 
         run_serial(folder, run)
     else:
-        result = asyncio.run(supervise(folder, run, view=options.view))
+        placement = placement_of(options, run)
+        for line in joining_lines(run, placement):
+            say(line)
+        result = asyncio.run(supervise(folder, run, placement=placement))
         if result.outcome is Outcome.INTERRUPTED:
             say(
                 f"interrupted; go on with: slipstream train dqn --resume --run {folder}"
