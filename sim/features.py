@@ -184,7 +184,7 @@ def nearest(
     )
     rank = nearer.sum(1)
     match = rank[None] == jnp.arange(count)[:, None]
-    chosen = (match * index[None]).sum(1)
+    chosen = jnp.where(match, index[None], 0).sum(1)
     return chosen, (match & seen[None]).any(1)
 
 

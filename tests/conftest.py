@@ -18,6 +18,10 @@ from pathlib import Path  # noqa: E402
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
+from sim.bank import BankFile  # noqa: E402
+from sim.scene import Scene  # noqa: E402
+from tests import scenes  # noqa: E402
+
 # Broadcasting and promotion are spelled out in the code: a missing axis or a stray
 # float64 is a bug to find here, not a slow or wrong program later.
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -34,3 +38,12 @@ def scenes_data() -> Path:
     if not path.is_dir():
         pytest.skip(f"SLIPSTREAM_DATA: no folder {path}")
     return path
+
+
+@pytest.fixture(scope="session")
+def real(
+    scenes_data: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[tuple[Scene, ...], BankFile]:
+    """Every recorded scene, and one bank of them all."""
+    recorded = scenes.real(scenes_data)
+    return recorded, scenes.bank_of(recorded, tmp_path_factory.mktemp("real"))

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from sim import metrics
 from sim.bank import BankFile
 from sim.dynamics import ObjectState
-from sim.scene import Scene
 from tests import oracle, scenes
 
 BOXES = 6
@@ -109,14 +108,6 @@ def test_corners_are_the_oracles(row) -> None:
         metrics.Box(*(jnp.float32(value) for value in row))
     )
     np.testing.assert_allclose(found, corners_of(box)[0], atol=1e-5)
-
-
-@pytest.fixture(scope="module")
-def real(
-    scenes_data: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[tuple[Scene, ...], BankFile]:
-    recorded = scenes.real(scenes_data)
-    return recorded, scenes.bank_of(recorded, tmp_path_factory.mktemp("real"))
 
 
 def test_overlap_of_every_logged_object_of_the_real_scenes(real) -> None:

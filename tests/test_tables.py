@@ -65,14 +65,6 @@ def bank_with(folder: Path, *roads: Polyline) -> BankFile:
     return scenes.bank_of([scenes.scene_of([scenes.driver()], roads=roads)], folder)
 
 
-@pytest.fixture(scope="module")
-def real(
-    scenes_data: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[tuple[Scene, ...], BankFile]:
-    recorded = scenes.real(scenes_data)
-    return recorded, scenes.bank_of(recorded, tmp_path_factory.mktemp("real"))
-
-
 def assert_logged_agree(recorded: Sequence[Scene], file: BankFile, every: int) -> None:
     """All objects of the real scenes, each so many steps."""
     pairs = 0
@@ -166,7 +158,11 @@ def test_a_map_of_random_polylines(tmp_path: Path) -> None:
 
 
 def test_finely_sampled_edges(tmp_path: Path) -> None:
-    """A thin, wavy median with a point every 5 cm: many candidates in a cell."""
+    """A thin, wavy median with a point every 5 cm: more candidates than are kept.
+
+    The nearest to the cell's centre are, so what is lost can matter close to an edge
+    only: measured, 5 points of 20,000 beyond 1 cm, the farthest at 5 cm.
+    """
     x = np.arange(0, 30, 0.05)
     y = 0.4 * np.sin(x)
     there = np.stack([x, y + 0.15], -1)
@@ -180,9 +176,11 @@ def test_finely_sampled_edges(tmp_path: Path) -> None:
         [rng.uniform(1, 29, 1000), rng.uniform(-0.8, 0.8, 1000)], -1
     ) - np.array(file.origins[0][:2])
     z = np.zeros(1000, np.float32)
-    expected, near = by_definition(edges, boxes, z)
-    found = judged(file, 0, boxes, z)
-    np.testing.assert_array_equal(found[~near], expected[~near])
+    expected, _ = by_definition(edges, boxes, z)
+    differs = judged(file, 0, boxes, z) != expected
+    distance = scenes.planar_distance(boxes[:, :2].astype(np.float64), edges)
+    assert not differs[distance > 0.1].any()
+    assert differs[distance > NEAR].sum() <= 2
 
 
 def test_the_left_of_an_edge_is_the_road(tmp_path: Path) -> None:
