@@ -263,11 +263,12 @@ async def supervise(
     from launch.console import RunConsole
     from replay.keys import RunKeys
 
+    placement = placement or Placement()
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
     console = Console()
     supervisor = Supervisor(
-        roles=roles_of(folder, run, port, placement or Placement()),
+        roles=roles_of(folder, run, port, placement),
         log_folder=folder / LOGS,
         on_event=lambda line: console.print(line, highlight=False),
         before_stop=lambda: shown.last_look(),
@@ -283,7 +284,7 @@ async def supervise(
     )
     with announced(folder, run, endpoint):
         beside = [asyncio.create_task(shown.follow())]
-        if view:
+        if placement.view:
             log = folder / LOGS / "viewer.log"
             beside.append(asyncio.create_task(_tell_page(log, console)))
         try:
