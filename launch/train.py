@@ -154,15 +154,15 @@ class Placement:
     insecure: bool = False
 
 
-def placement_of(options: TrainConfig, run: RunFile) -> Placement:
-    """The command's, checked."""
+def placement_of(options: TrainConfig, actors: int) -> Placement:
+    """The command's, checked; `actors` is how many the run has in all."""
     from replay.session import check_endpoints
 
     check_endpoints(options.listen, options.insecure)
-    if not 0 <= options.remote_actors <= run.config.actors:
+    if not 0 <= options.remote_actors <= actors:
         raise LaunchError(
-            f"--remote-actors {options.remote_actors}: the run has "
-            f"{run.config.actors} actors in all; set --actors"
+            f"--remote-actors {options.remote_actors}: the run has {actors} actors in "
+            "all; set --actors"
         )
     if options.remote_actors and not options.listen:
         raise LaunchError(
@@ -299,6 +299,7 @@ async def supervise(
 
 def train_command(options: TrainConfig) -> int:
     """`slipstream train dqn`; the exit code."""
+    placement = placement_of(options, resolved(options).actors)
     folder, run = prepare(options)
     say(f"run: {folder}  ({', '.join(run.scenes)}, preset {options.preset})")
     if options.serial:
@@ -306,7 +307,6 @@ def train_command(options: TrainConfig) -> int:
 
         run_serial(folder, run)
     else:
-        placement = placement_of(options, run)
         for line in joining_lines(run, placement):
             say(line)
         result = asyncio.run(supervise(folder, run, placement=placement))
