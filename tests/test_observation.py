@@ -192,7 +192,7 @@ def busy_scene() -> Scene:
         Polyline(RoadKind.STOP_SIGN, np.array([[12.0, -6, 0]])),
         Polyline(
             RoadKind.CROSSWALK,
-            np.array([[20, -5, 0], [23, -5, 0], [23, 5, 0], [20, 5, 0]], float),
+            np.array([[20, -4, 0], [23, -4, 0], [23, 5, 0], [20, 5, 0]], float),
         ),
     ]
     states = rng.integers(0, 9, (3, scenes.STEPS))
