@@ -124,7 +124,7 @@ def quick() -> ExperimentConfig:
         environment=EnvironmentConfig(
             action=ActionConfig(acceleration_bins=5, curvature=0.15, curvature_bins=7),
             observation=ObservationConfig(neighbours=8, road_rows=32, lights=2),
-            progress=0.02,
+            progress=0.03,
             terminate=True,
         ),
         network=NetworkConfig(),
@@ -132,9 +132,9 @@ def quick() -> ExperimentConfig:
         replay=ReplayConfig(capacity=200_000, min_size=2_000, samples_per_insert=4.0),
         learner=LearnerConfig(
             learning_rate=5e-4,
-            discount=0.97,
+            discount=0.98,
             target_period=300,
-            average_updates=1_500,
+            average_updates=3_000,
             max_gradient_norm=10.0,
             loss="plain",
         ),

@@ -7,9 +7,9 @@ the action space's dynamics and all others to where they were recorded.
 Reward of the step from t-1 to t (Gulino et al., 2023, main text): minus overlap minus
 off-road at t. `progress` (off in the paper's preset) adds the metres gained along the
 logged route, since the paper's reward alone is satisfied by standing still. Metres
-ahead of where the log was at that step do not count, or speeding and running red
-lights would pay; the others count 1 - (aside / `progress_width`)^2, not below 0, where
-`aside` is the distance from the route.
+ahead of where the log was at that step count against it, or speeding, tailgating and
+running red lights would pay. All count 1 - (aside / `progress_width`)^2, not below 0,
+where `aside` is the distance from the route.
 
 Terminated is what ends the return (a failure, where `terminate` says so); truncated is
 the recording's end, after which there was more to come: only the first has discount 0.
@@ -158,11 +158,8 @@ def advance(
     position = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
         bank, state.scene, state.controlled, now[:, 0], now[:, 1]
     )
-    gained = jnp.minimum(
-        position.along, _logged_along(bank, state.scene, step_t, state.controlled)
-    ) - jnp.minimum(
-        state.along, _logged_along(bank, state.scene, state.step, state.controlled)
-    )
+    gained = _credit(bank, state.scene, step_t, state.controlled, position.along)
+    gained -= _credit(bank, state.scene, state.step, state.controlled, state.along)
     near = jnp.maximum(1.0 - (position.aside / config.progress_width) ** 2, 0.0)
     reward = (
         config.progress * gained * near
@@ -188,18 +185,19 @@ def advance(
     )
 
 
-def _logged_along(
+def _credit(
     bank: Bank,
     scene: Int[Array, ""],
     step: Int[Array, ""],
     controlled: Int[Array, " controlled"],
+    along: Float[Array, " controlled"],
 ) -> Float[Array, " controlled"]:
-    """How far the log was along its routes at a step [m]."""
+    """Metres along the routes, less those ahead of where the log was at the step."""
     row = bank.log[scene, step, controlled]
-    position = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
+    logged = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
         bank, scene, controlled, row[:, 0], row[:, 1]
-    )
-    return position.along
+    ).along
+    return along - 2.0 * jnp.maximum(along - logged, 0.0)
 
 
 def failures(
