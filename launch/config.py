@@ -114,7 +114,7 @@ class ExperimentConfig:
             raise ValueError(f"actors={self.actors} must be at least 1")
         self.replay.limiter().check_batches(
             insert_rows=self.actor.environments * self.actor.scan_steps,
-            sample_rows=self.learner.batch_size,
+            sample_rows=self.learner.batch_size * self.learner.batches_per_reply,
         )
 
 

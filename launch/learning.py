@@ -271,7 +271,8 @@ def learner_role(join: JoinConfig, stop: threading.Event) -> None:
             keys=place.keys,
             spec=row_spec(config.environment.observation.history),
             batch_size=config.learner.batch_size,
-            in_flight=4,  # where roles share cores, two left the learner waiting
+            batches_per_reply=config.learner.batches_per_reply,
+            in_flight=2,
         )
         steps = learn(
             learner=learner,

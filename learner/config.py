@@ -48,6 +48,10 @@ class LearnerConfig:
     """Whose arithmetic: torchrl's `DQNLoss`, or the same in plain torch, which is
     faster and equal to it by test."""
 
+    batches_per_reply: int = 4
+    """Batches that one reply of the replay brings: a query's cost is shared by them,
+    and their priorities are older by as many updates."""
+
     publish_period: int = 50
     """Updates between two publications of the weights to the actors."""
 
@@ -69,6 +73,7 @@ class LearnerConfig:
             "target_period",
             "huber_threshold",
             "reward_clip",
+            "batches_per_reply",
             "publish_period",
             "torch_threads",
         ):
