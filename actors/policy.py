@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,22 +74,37 @@ def find_policy(path: Path) -> Path:
     return file
 
 
+# What numpy, zipfile and json raise for files that are cut, damaged or of another kind.
+_UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
 def read_policy(path: Path) -> Policy:
     """Reads a policy, whichever of its folders is named."""
     file = find_policy(path)
     try:
         with np.load(file, allow_pickle=False) as arrays:
+            named = str(arrays["layout_hash"])
             policy = Policy(
-                vector=arrays["vector"],
-                network=NetworkConfig(**json.loads(str(arrays["network"]))),
-                sizes=ObservationSizes(**json.loads(str(arrays["sizes"]))),
+                vector=_weights(arrays["vector"]),
+                network=NetworkConfig(**_whole_numbers(arrays["network"])),
+                sizes=ObservationSizes(**_whole_numbers(arrays["sizes"])),
                 actions=int(arrays["actions"]),
                 extra=json.loads(str(arrays["extra"])),
             )
-            named = str(arrays["layout_hash"])
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except _UNREADABLE as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
         raise PolicyError(
-            f"{file}: cannot be read as a policy ({error}); it is damaged or of "
+            f"{file}: cannot be read as a policy ({reason}); it is damaged or of "
             "another version: use another checkpoint"
         ) from error
     layout = parameter_layout(policy.network, policy.sizes, policy.actions)
@@ -100,6 +116,21 @@ def read_policy(path: Path) -> Policy:
             f"program lays it out as {layout_hash(layout)}); use another checkpoint"
         )
     return policy
+
+
+def _weights(vector: np.ndarray) -> np.ndarray:
+    """The vector, if it is one; ValueError else."""
+    if vector.ndim != 1 or vector.dtype != np.float32:
+        raise ValueError(f"weights are {vector.dtype} of shape {vector.shape}")
+    return vector
+
+
+def _whole_numbers(text: np.ndarray) -> dict[str, int]:
+    """A JSON object of whole numbers; ValueError else."""
+    values = json.loads(str(text))
+    if any(type(value) is not int for value in values.values()):
+        raise ValueError(f"{values} are not all whole numbers")
+    return dict(values)
 
 
 def greedy(
