@@ -1,5 +1,8 @@
 """Agents without learning: where each goes."""
 
+import functools
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +11,7 @@ import pytest
 from sim import agents, environment
 from sim.agents import Agent, ExpertSpace
 from sim.bank import BankFile
-from sim.dynamics import ActionSpace, action_table
+from sim.dynamics import ActionConfig, ActionSpace, action_table
 from sim.environment import EnvironmentConfig
 from sim.procedural import generate_many
 from tests import scenes
@@ -22,14 +25,13 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> BankFile:
     return scenes.bank_of(list(generate_many(9, 2)), tmp_path_factory.mktemp("agents"))
 
 
-def drive(
-    file: BankFile, agent: Agent, seed: int = 0, scene: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """States [steps, objects, 5] and actions of the first objects, to the end."""
+@functools.cache
+def rollout(agent: Agent) -> Callable[..., tuple[jax.Array, jax.Array]]:
+    """Compiled once for an agent."""
 
     def one(key, bank):
         state = environment.reset(
-            bank, jnp.int32(scene), jnp.arange(OBJECTS, dtype=jnp.int32), CONFIG
+            bank, jnp.int32(0), jnp.arange(OBJECTS, dtype=jnp.int32), CONFIG
         )
 
         def step(state, step_key):
@@ -39,15 +41,20 @@ def drive(
 
         return jax.lax.scan(step, state, jax.random.split(key, 80))[1]
 
-    states, actions = jax.jit(one)(jax.random.key(seed), file.bank)
+    return jax.jit(one)
+
+
+def drive(file: BankFile, agent: Agent, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """States [steps, objects, 5] and actions of the first objects, to the end."""
+    states, actions = rollout(agent)(jax.random.key(seed), file.bank)
     return np.asarray(states), np.asarray(actions)
 
 
-def logged(file: BankFile, scene: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def logged(file: BankFile) -> tuple[np.ndarray, np.ndarray]:
     """The same states of the log, and where they were always recorded."""
-    start = int(file.arrays["current_step"][scene])
-    log = file.arrays["log"][scene, start + 1 :, :OBJECTS][..., [0, 1, 3, 4, 5]]
-    return log, file.arrays["log_valid"][scene, start:, :OBJECTS].all(0)
+    start = int(file.arrays["current_step"][0])
+    log = file.arrays["log"][0, start + 1 :, :OBJECTS][..., [0, 1, 3, 4, 5]]
+    return log, file.arrays["log_valid"][0, start:, :OBJECTS].all(0)
 
 
 def apart(file: BankFile, states: np.ndarray) -> float:
@@ -80,7 +87,7 @@ def test_experts_stay_near_the_log(file: BankFile, space, on_grid, most) -> None
 @pytest.mark.parametrize("space", list(ActionSpace))
 def test_experts_on_the_grid_take_its_actions(file: BankFile, space) -> None:
     states, actions = drive(file, agents.expert(CONFIG, ExpertSpace(space, True)))
-    grid = EnvironmentConfig().action.__class__(space=space)
+    grid = ActionConfig(space=space)
     assert actions.min() >= 0
     assert actions.max() < grid.count
     assert len(np.unique(actions)) > 3

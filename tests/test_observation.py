@@ -76,6 +76,35 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> BankFile:
     return scenes.bank_of(list(generate_many(21, 3)), tmp_path_factory.mktemp("made"))
 
 
+def busy_scene() -> Scene:
+    """A curving car among others, with lights and every class of map feature."""
+    rng = np.random.default_rng(6)
+    drivers = [scenes.driver(yaw=0.1, speed=8.0)]
+    drivers += [
+        scenes.driver(
+            x=float(rng.uniform(-30, 30)),
+            y=float(rng.uniform(-20, 20)),
+            yaw=float(rng.uniform(-3, 3)),
+            speed=float(rng.uniform(0, 12)),
+        )
+        for _ in range(9)
+    ]
+    roads = [
+        *scenes.corridor(end=57.0),  # not a whole number of pieces
+        Polyline(RoadKind.LANE_STREET, np.array([[-60, 1, 0], [57, 2, 0]], float)),
+        Polyline(RoadKind.LINE_BROKEN_WHITE, np.array([[0, 3, 0], [9, 4, 0.0]])),
+        Polyline(RoadKind.STOP_SIGN, np.array([[12.0, -6, 0]])),
+        Polyline(
+            RoadKind.CROSSWALK,
+            np.array([[20, -4, 0], [23, -4, 0], [23, 5, 0], [20, 5, 0]], float),
+        ),
+    ]
+    states = rng.integers(0, 9, (3, scenes.STEPS))
+    stops = np.array([[18.0, 2, 0], [18, -2, 0], [-25, 3, 0]])
+    lights = TrafficLights(np.arange(3), stops, states)
+    return scenes.scene_of(drivers, roads=roads, lights=lights)
+
+
 def hand_scenes() -> dict[str, Scene]:
     """One bank holds them all, so that `observe` compiles once."""
     drivers = [scenes.driver(), scenes.driver(y=59.9), scenes.driver(y=-60.1)]
@@ -112,6 +141,11 @@ def hand_scenes() -> dict[str, Scene]:
         states = np.tile(np.arange(first, first + 3)[:, None], (1, scenes.STEPS))
         stops = np.stack([np.arange(6.0, 9), np.zeros(3), np.zeros(3)], -1)
         result[f"states{first}"] = lit(stops, states)
+    rng = np.random.default_rng(1)
+    result["busy"] = busy_scene()
+    for number in range(10):
+        turn, shift = rng.uniform(-np.pi, np.pi), rng.uniform(-2000, 2000, 2)
+        result[f"moved{number}"] = scenes.moved(busy_scene(), turn, shift)
     return result
 
 
@@ -172,50 +206,12 @@ def test_sizes_that_show_nothing_are_refused(wrong: dict, message: str) -> None:
         ObservationConfig(**wrong)
 
 
-def busy_scene() -> Scene:
-    """A curving car among others, with lights and every class of map feature."""
-    rng = np.random.default_rng(6)
-    drivers = [scenes.driver(yaw=0.1, speed=8.0)]
-    drivers += [
-        scenes.driver(
-            x=float(rng.uniform(-30, 30)),
-            y=float(rng.uniform(-20, 20)),
-            yaw=float(rng.uniform(-3, 3)),
-            speed=float(rng.uniform(0, 12)),
-        )
-        for _ in range(9)
-    ]
-    roads = [
-        *scenes.corridor(end=57.0),  # not a whole number of pieces
-        Polyline(RoadKind.LANE_STREET, np.array([[-60, 1, 0], [57, 2, 0]], float)),
-        Polyline(RoadKind.LINE_BROKEN_WHITE, np.array([[0, 3, 0], [9, 4, 0.0]])),
-        Polyline(RoadKind.STOP_SIGN, np.array([[12.0, -6, 0]])),
-        Polyline(
-            RoadKind.CROSSWALK,
-            np.array([[20, -4, 0], [23, -4, 0], [23, 5, 0], [20, 5, 0]], float),
-        ),
-    ]
-    states = rng.integers(0, 9, (3, scenes.STEPS))
-    stops = np.array([[18.0, 2, 0], [18, -2, 0], [-25, 3, 0]])
-    lights = TrafficLights(np.arange(3), stops, states)
-    return scenes.scene_of(drivers, roads=roads, lights=lights)
-
-
-def test_turning_and_moving_the_map_changes_nothing(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    """Ten random moves of one scene, in one bank so that all compile once."""
-    rng = np.random.default_rng(1)
-    scene = busy_scene()
-    every = [scene] + [
-        scenes.moved(scene, rng.uniform(-np.pi, np.pi), rng.uniform(-2000, 2000, 2))
-        for _ in range(10)
-    ]
-    file = scenes.bank_of(every, tmp_path_factory.mktemp("moved"))
+def test_turning_and_moving_the_map_changes_nothing(hand: BankFile) -> None:
+    """Ten random moves of one scene."""
     for controlled in (0, 3):
-        one = seen(file, 0, 8, controlled)
-        for index in range(1, len(every)):
-            other = seen(file, index, 8, controlled)
+        one = seen(hand, HAND.index("busy"), 8, controlled)
+        for index in range(10):
+            other = seen(hand, HAND.index(f"moved{index}"), 8, controlled)
             for name in ("ego", "agents", "agents_valid", "lights", "lights_valid"):
                 np.testing.assert_allclose(
                     getattr(one, name), getattr(other, name), atol=1e-3, err_msg=name
@@ -385,12 +381,10 @@ def test_far_from_the_map_nothing_breaks(made: BankFile) -> None:
     assert not found.agents_valid.any()
 
 
-def test_scenes_in_one_bank_do_not_mix(tmp_path: Path) -> None:
-    every = [*generate_many(21, 2), busy_scene()]
-    together = scenes.bank_of(every, tmp_path, "together")
-    alone = scenes.bank_of(every[2:], tmp_path, "alone")
+def test_scenes_in_one_bank_do_not_mix(hand: BankFile, tmp_path: Path) -> None:
+    alone = scenes.bank_of([busy_scene()], tmp_path)
     for step in (5, 15):
-        one, other = seen(together, 2, step, 0), seen(alone, 0, step, 0)
+        one, other = seen(hand, HAND.index("busy"), step, 0), seen(alone, 0, step, 0)
         for name, value in one._asdict().items():
             np.testing.assert_allclose(
                 value, getattr(other, name), atol=1e-6, err_msg=name
