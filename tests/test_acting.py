@@ -219,6 +219,14 @@ class Sent(NamedTuple):
     vector: np.ndarray
 
 
+def aligned(vector: np.ndarray) -> np.ndarray:
+    """A copy at an address at which JAX may use the memory as it is."""
+    space = np.empty(len(vector) + 16, np.float32)
+    skip = -space.ctypes.data % 64 // 4
+    space[skip : skip + len(vector)] = vector
+    return space[skip : skip + len(vector)]
+
+
 def loop(
     file: BankFile, versions: list[int], *, spoil: bool = False, show=None
 ) -> tuple[list, np.ndarray]:
@@ -227,7 +235,7 @@ def loop(
     With `spoil` the weights' buffer is overwritten after each scan, as by a channel
     that receives the next message into it.
     """
-    buffer = np.array(weights(0))
+    buffer = aligned(np.asarray(weights(0)))
     sent = iter(versions)
     known = [0]
     written: list[np.ndarray] = []
