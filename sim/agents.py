@@ -1,8 +1,10 @@
 """Agents that need no learning: playback, expert, constant speed, random.
 
 An agent says where the controlled objects of one scene are at the next step. The
-experts are the paper's (appendix A.1): the log's action by the inverse dynamics,
-applied to the simulated state, so that the action space's limits and errors show.
+experts are the paper's (appendix A.1): the log through the inverse dynamics, so that
+the action space's limits and errors show. The paper leaves open from which state; here
+it is the simulated one to the log's next: from the log's own, a car whose velocity
+points a little aside of its yaw turns away by that angle again at every step.
 """
 
 import dataclasses
@@ -102,29 +104,26 @@ def expert(config: EnvironmentConfig, through: ExpertSpace) -> Agent:
     grid = dataclasses.replace(config.action, space=through.space)
 
     def one(
-        now: ObjectState, logged: ObjectState, following: ObjectState
+        now: ObjectState, following: ObjectState
     ) -> tuple[Float[Array, "5"], Int[Array, ""]]:
         if through.space == ActionSpace.BICYCLE:
-            action = dynamics.bicycle_inverse(logged, following, config.dt)
+            action = dynamics.bicycle_inverse(now, following, config.dt)
         else:
-            action = dynamics.delta_inverse(logged, following)
+            action = dynamics.delta_inverse(now, following)
         if through.on_grid:
-            index = dynamics.nearest_action(logged, action, grid)
+            index = dynamics.nearest_action(now, action, grid)
             moved = dynamics.apply_discrete(now, index, grid, config.dt)
             return jnp.stack(moved), index
         if through.space == ActionSpace.BICYCLE:
-            moved = dynamics.bicycle_replay(now, logged, following, config.dt)
+            moved = dynamics.bicycle_replay(now, following, config.dt)
         else:
             moved = dynamics.delta(now, action, config.dt)
         return jnp.stack(moved), jnp.int32(-1)
 
     def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
-        logged = logged_states(bank, state.scene, state.step, state.controlled)
-        following = _next_logged(bank, state)
         moved, action = jax.vmap(one)(
             ObjectState(*state.history[:, -1].T),
-            ObjectState(*logged.T),
-            ObjectState(*following.T),
+            ObjectState(*_next_logged(bank, state).T),
         )
         return Decision(moved, action, jnp.zeros((action.shape[0], 0), jnp.float32))
 

@@ -102,14 +102,14 @@ def bicycle_inverse(
 
 
 def bicycle_replay(
-    state: ObjectState, logged: ObjectState, following: ObjectState, dt: float
+    state: ObjectState, following: ObjectState, dt: float
 ) -> ObjectState:
-    """The log's Bicycle action from `logged` to `following`, applied to `state`.
+    """Follows the log by the Bicycle action from `state` to the log's `following`.
 
     Below `SLOW`, where the action holds no curvature, the recorded yaw is used.
     """
-    moved = bicycle(state, bicycle_inverse(logged, following, dt), dt)
-    slow = (jnp.hypot(logged.v_x, logged.v_y) < SLOW) | (
+    moved = bicycle(state, bicycle_inverse(state, following, dt), dt)
+    slow = (jnp.hypot(state.v_x, state.v_y) < SLOW) | (
         jnp.hypot(following.v_x, following.v_y) < SLOW
     )
     speed = jnp.hypot(moved.v_x, moved.v_y)
