@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sim import edge_table, tables
-from sim.scene import Scene
+from sim.scene import Scene, SceneError
 
 Converted = dict[str, Any]  # one scene's part of every array of the bank
 
@@ -21,7 +21,7 @@ ROUTE_AHEAD = 40.0  # m that a route goes on straight behind the log's end
 ROUTE_STEP = 0.5  # m: shorter moves are jitter of a standing object
 ROWS = 64  # road segments kept per cell
 FEW = 12  # scenes
-MAX_CANDIDATES = 32  # edges per fine cell; measured: 12 to 30 at the 99th percentile
+MAX_CANDIDATES = 64  # edges per fine cell; measured: 12 to 30 at the 99th percentile
 
 
 def origin_of(scene: Scene) -> Float[np.ndarray, "3"]:
@@ -99,7 +99,7 @@ def convert_all(scenes: Iterable[Scene], *, workers: int) -> Iterator[Converted]
 
 def _check_small(scene: Scene, what: str, count: int, limit: int) -> None:
     if count > limit:
-        raise ValueError(
+        raise SceneError(
             f"{scene.source or scene.scenario_id}: {count} {what}, at most {limit}; "
             "crop the map"
         )

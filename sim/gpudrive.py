@@ -146,7 +146,7 @@ def parse_gpudrive(text: bytes, *, source: str) -> Scene:
         Scene(
             scenario_id=file.scenario_id or Path(file.name or source).stem,
             dt=_DT,
-            current_step=max(min(_CURRENT_STEP, steps - 1), 0),
+            current_step=max(min(_CURRENT_STEP, steps - 2), 0),
             sdc_index=metadata.sdc_track_index,
             object_ids=np.array(
                 [i if o.id is None else o.id for i, o in enumerate(file.objects)],

@@ -87,8 +87,11 @@ def offroad(
     The drivable side is an edge's left. Where the nearest point is a polyline's
     vertex both adjoining segments decide: in a left turn the point must be left of
     both, in a right turn left of either. Corners take the height `z` of the centre
-    [m], and differences of height count twice in the distance. Exact up to float32:
-    the cell's candidates hold every edge that can be the nearest (`sim.edge_table`).
+    [m], and differences of height count twice in the distance. Exact up to float32
+    within the grid (10 m around map and logs): the cell's candidates hold every edge
+    that can be the nearest (`sim.edge_table`), at most `convert.MAX_CANDIDATES`, which
+    no real scene at hand exceeds by more than a few cells. Outside the grid the border
+    cell's candidates decide.
     """
     side = jax.vmap(_on_left, in_axes=(None, None, 0, None))
     return ~side(bank, scene, corners(box), z).all()

@@ -71,7 +71,7 @@ def _index_problems(scene: Scene) -> Iterator[str]:
     if not (math.isfinite(scene.dt) and scene.dt > 0):
         yield f"the step length is {scene.dt} s, expected a positive number"
     indices = (
-        ("current step", scene.current_step, scene.steps, "steps"),
+        ("current step", scene.current_step, scene.steps - 1, "steps to act at"),
         ("SDC index", scene.sdc_index, scene.objects, "objects"),
         *(
             ("track to predict", index, scene.objects, "objects")

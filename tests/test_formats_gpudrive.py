@@ -84,8 +84,8 @@ def test_the_first_versions_of_the_format_are_read() -> None:
     ]
 
 
-def test_a_short_scene_acts_at_its_last_step() -> None:
-    assert _parse(records.gpudrive(steps=4) | {"tl_states": {}}).current_step == 3
+def test_a_short_scene_acts_at_its_last_step_but_one() -> None:
+    assert _parse(records.gpudrive(steps=4) | {"tl_states": {}}).current_step == 2
 
 
 @pytest.mark.parametrize(

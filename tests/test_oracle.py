@@ -77,6 +77,7 @@ def test_kinematic_infeasibility_by_hand() -> None:
     # Speed before and after, and the heading of the velocity after; yaw is 0.
     cases = ((5.0, 7.0, 0.0), (1.0, 1.0, 0.05), (1.0, 1.0, 0.02), (0.5, 0.5, 3.0))
     message = records.scenario(objects=len(cases), steps=4)
+    message.current_time_index = 0
     for track, (before, after, heading) in zip(message.tracks, cases, strict=True):
         track.states[1].velocity_x = 100.0  # an invalid state, which decides nothing
         track.states[2].velocity_x = before
