@@ -150,7 +150,7 @@ def _set(path: str, value: object) -> Any:
     [
         (_set("sdc_track_index", 2), "SDC index 2 is not among 2 objects"),
         (_set("sdc_track_index", -1), "SDC index -1 is not among"),
-        (_set("current_time_index", 12), "current step 12 is not among 11 steps to act at"),
+        (_set("current_time_index", 12), "current step 12 is not among 11"),
         (_set("tracks_to_predict.0.track_index", 9), "track to predict 9 is not"),
         (_set("scenario_id", b""), "the scenario has no id"),
         (_set("tracks.1.object_type", 9), "track 1 is of unknown type 9"),
