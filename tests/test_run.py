@@ -18,7 +18,7 @@ import psutil
 import pytest
 
 from actors.rows import row_spec
-from launch.config import BudgetConfig, read_run
+from launch.config import BudgetConfig, quick, read_run
 from launch.train import free_port
 from replay.client import fetch_rows, fetch_stats
 from replay.keys import RunKeys
@@ -172,10 +172,11 @@ def test_a_run_ends_with_scores_and_a_recording(tmp_path: Path) -> None:
     assert (folder / "evaluation.rrd").stat().st_size > 10_000
     assert (folder / "curves.png").stat().st_size > 10_000
     status = json.loads((folder / "status.json").read_text())
-    # Until the replay holds 500 rows nothing is sampled; from then on, 8 of each.
+    # Until the replay holds 500 rows nothing is sampled; from then on, 4 of each.
     replay = status["replay"]
     ratio = replay["samples"] / (replay["inserts"] - replay["min_size"])
-    assert ratio == pytest.approx(8.0, rel=0.05)
+    assert status["configured_samples_per_insert"] == quick().replay.samples_per_insert
+    assert ratio == pytest.approx(quick().replay.samples_per_insert, rel=0.02)
 
 
 def test_ctrl_c_stops_a_run_and_it_can_be_resumed(tmp_path: Path) -> None:
