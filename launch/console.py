@@ -5,6 +5,7 @@ service's counters, which are exact. The last ones are written to `status.json`.
 """
 
 import asyncio
+import contextlib
 import json
 import time
 from collections.abc import Callable, Mapping
@@ -161,7 +162,6 @@ class RunConsole:
         self._statuses: StatusSubscriber | None = None
         self._rate = _Rate()
         self._stats: dict[str, Any] = {}
-        self._cpu: dict[int, psutil.Process] = {}
         self.figures: dict[str, Any] = {}
         """What was shown last."""
 
@@ -178,7 +178,7 @@ class RunConsole:
     async def last_look(self) -> None:
         """The final counters, while the replay service is still up."""
         if self._session is not None:
-            await self._look(last=True)
+            await self._look()
 
     async def _connect(self) -> "zenoh.Session":
         while True:
@@ -207,7 +207,7 @@ class RunConsole:
                 print(line_of(self.figures), flush=True)
             await asyncio.sleep(_TERMINAL_S)
 
-    async def _look(self, last: bool = False) -> None:
+    async def _look(self) -> None:
         assert self._session is not None and self._statuses is not None
         try:
             self._stats = await asyncio.to_thread(
@@ -221,22 +221,22 @@ class RunConsole:
         figures["steps_per_s"] = self._rate.add(now, figures["steps"])
         figures["looked_s"] = now
         figures["restarts"] = sum(self._supervisor.restarts.values())
-        # At the end roles are gone and the time since the last look is short.
-        figures["cpu"] = self.figures.get("cpu", {}) if last else self._processors()
+        figures["cpu"] = self._processors()
         figures["roles"] = {name: dict(values) for name, (_, values) in roles.items()}
         self.figures = figures
         self._on_look(figures)
 
     def _processors(self) -> dict[str, float]:
-        """Share of a processor that each role uses."""
-        shares = {}
+        """Share of a processor that each role has used, over its life so far.
+
+        Of a role that has ended, the last share known.
+        """
+        shares = dict(self.figures.get("cpu", {}))
         for name, pid in self._supervisor.pids.items():
-            try:
-                # Kept: the share is over the time since the last question.
-                process = self._cpu.setdefault(pid, psutil.Process(pid))
-                shares[name] = process.cpu_percent() / 100
-            except psutil.Error:
-                self._cpu.pop(pid, None)
+            with contextlib.suppress(psutil.Error):
+                process = psutil.Process(pid)
+                used, lived = process.cpu_times(), time.time() - process.create_time()
+                shares[name] = (used.user + used.system) / max(lived, 1.0)
         return shares
 
     def _table(self) -> Table:
