@@ -21,7 +21,7 @@ from rich.table import Table
 from launch.config import ExperimentConfig, write_atomically
 from launch.status import actor_rates
 from launch.supervisor import Supervisor
-from replay.channels import StatusSubscriber
+from replay.channels import StatusSubscriber, send_stop
 from replay.client import fetch_stats
 from replay.keys import RunKeys
 from replay.session import ConnectError, open_session
@@ -176,9 +176,13 @@ class RunConsole:
                 self._session = None
 
     async def last_look(self) -> None:
-        """The final counters, while the replay service is still up."""
+        """The final counters, while the replay service is still up.
+
+        Then the run is called off, for roles that other machines started.
+        """
         if self._session is not None:
             await self._look()
+            send_stop(self._session, self._keys, "the run has ended")
 
     async def _connect(self) -> "zenoh.Session":
         while True:
