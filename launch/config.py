@@ -5,9 +5,9 @@ processes of a run share. Two presets:
 
     quick   learns to drive on two cores in minutes: a small network, few road rows, a
             progress reward (the paper's reward is satisfied by standing still), a
-            higher learning rate
-    paper   appendix A.2 of the Waymax paper, else Acme's (`paper.md` of the issue
-            tracker's design; the components' defaults)
+            higher learning rate, averaged weights; the README lists what differs
+    paper   appendix A.2 of the Waymax paper, else Acme's: the components' defaults,
+            with a network of the paper's width
 
 `RunFile` is what is written: the configuration with the run's id and the banks'
 hashes, so that a process that joins can tell whether it has the same scenes.

@@ -17,7 +17,7 @@ from jaxtyping import Float, Integer
 from replay.control import StatsReply, decode
 from replay.keys import RunKeys
 from replay.session import ask
-from replay.spec import ReplayError, RowSpec, Sample, importance_weights
+from replay.spec import ReplayError, RowSpec, Sample
 from replay.wire import (
     FetchRequest,
     SampleReply,
@@ -33,7 +33,6 @@ __all__ = [
     "Writer",
     "fetch_rows",
     "fetch_stats",
-    "importance_weights",
 ]
 
 _ANSWER_MARGIN_S = 5.0  # between the service's last moment to answer and giving up

@@ -124,12 +124,3 @@ class Sample:
     rows: np.ndarray  # [batch], structured by the spec; may be read-only
     size: int  # rows in the table when they were drawn
     inserts: int  # rows ever inserted when they were drawn
-
-
-def importance_weights(
-    probabilities: Float[np.ndarray, " batch"], *, exponent: float
-) -> Float[np.ndarray, " batch"]:
-    """Weights (1/p)^exponent over the batch's largest, in (0, 1] (as Acme has it)."""
-    # From logarithms: (1/p)^exponent overflows for the rarest rows, the ratio cannot.
-    logarithms = -exponent * np.log(probabilities)
-    return np.asarray(np.exp(logarithms - logarithms.max()), np.float32)

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-SLOW = 0.6  # m/s, paper.md A.1
+SLOW = 0.6  # m/s; the paper leaves the limit open
 
 
 class ObjectState(NamedTuple):
