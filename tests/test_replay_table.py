@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from replay.limiter import LimiterError
 from replay.local import LocalReplay, ReplayConfig
-from replay.spec import ReplayError, Sample, importance_weights
+from replay.spec import ReplayError, Sample
 from replay.table import PriorityError, Table
 from tests.replay_parts import SMALL, SPEC, make_rows
 
@@ -224,10 +224,3 @@ def test_updates_of_rows_that_are_gone_are_counted() -> None:
     replay.insert(make_rows(10, 5))
     replay.update_priorities(np.array([4, 5]), np.array([2.0, 2.0]))
     assert replay.stale_updates == 1
-
-
-def test_importance_weights() -> None:
-    """By hand: (1/p)^0.5 of 1, 1/4, 1/16 is 1, 2, 4; over the largest."""
-    weights = importance_weights(np.array([1.0, 0.25, 0.0625]), exponent=0.5)
-    np.testing.assert_allclose(weights, [0.25, 0.5, 1.0])
-    assert importance_weights(np.array([1e-300, 1.0]), exponent=2.0)[0] == 1.0
