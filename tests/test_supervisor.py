@@ -186,8 +186,11 @@ def test_what_ignores_a_request_is_killed_with_its_children(tmp_path: Path) -> N
 
 
 HOST = f"""
-import asyncio, json, sys
+import asyncio, json, signal, sys
 from pathlib import Path
+# What a shell's background job or nohup ignores, its children ignore too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 sys.path.insert(0, {str(ROOT)!r})
 from launch.supervisor import Role, Supervisor
 
@@ -211,8 +214,6 @@ def hosted(folder: Path, grace_s: float) -> Iterator[tuple[psutil.Process, list[
         [sys.executable, "-c", HOST, str(folder), json.dumps(STUBBORN), str(grace_s)],
         stdout=subprocess.PIPE,
         start_new_session=True,
-        # A shell's background job has Ctrl-C ignored, and its children inherit that.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     logs = [folder / f"role{index}.log" for index in range(3)]
     try:
