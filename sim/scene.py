@@ -87,6 +87,15 @@ class Polyline:
     entry_lanes: tuple[int, ...] = ()  # lanes only: feature ids
     exit_lanes: tuple[int, ...] = ()
     speed_limit: float = 0.0  # m/s, 0 where unknown
+    stop_lanes: tuple[int, ...] = ()  # stop signs only: feature ids of their lanes
+
+
+@dataclass(frozen=True)
+class LanePath:
+    """One way that the SDC could have gone: a path sample of WOMD 1.3.1."""
+
+    points: Float[np.ndarray, "points 3"]  # m, along the lanes' centres
+    on_route: bool  # whether the recorded drive went along it
 
 
 @dataclass(frozen=True)
@@ -123,6 +132,8 @@ class Scene:
     roads: tuple[Polyline, ...]
     lights: TrafficLights
     tracks_to_predict: tuple[int, ...] = ()
+    objects_of_interest: tuple[int, ...] = ()  # rows, as tracks_to_predict
+    sdc_paths: tuple[LanePath, ...] = ()  # none where the source has no samples
     source: str = field(default="", compare=False)  # file and record, for messages
 
     @property
