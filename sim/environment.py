@@ -87,6 +87,16 @@ def logged_states(
     return jnp.stack([row[:, 0], row[:, 1], row[:, 3], row[:, 4], row[:, 5]], -1)
 
 
+def current_objects(
+    bank: Bank, state: State
+) -> tuple[Float[Array, "objects 5"], Bool[Array, " objects"]]:
+    """All objects' states now, and which are there: simulated where controlled."""
+    row = bank.log[state.scene, state.step]
+    logged = jnp.stack([row[:, 0], row[:, 1], row[:, 3], row[:, 4], row[:, 5]], -1)
+    now = logged.at[state.controlled].set(state.history[:, -1])
+    return now, bank.log_valid[state.scene, state.step]
+
+
 def reset(
     bank: Bank,
     scene: Int[Array, ""],
