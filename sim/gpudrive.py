@@ -8,10 +8,12 @@ edges are WOMD's. Source: `data_utils/process_waymo_files.py` of Emerge-Lab/gpud
 
 Departures, all from the format holding less than WOMD: the step is 0.1 s and the
 current step 10 (or the last one of a shorter scene); lanes have neither connections
-nor speed limits. Values at invalid steps (-10000) are zeros here. Files of the
-converter's first versions, which lack `metadata`, ids and `map_element_id`, are read
-too: there the SDC is the last object (WOMD puts it there), headings are degrees if
-one exceeds a full turn in radians, and a road's kind follows from its `type`.
+nor speed limits, stop signs name no lanes. Objects of interest are ids in the file:
+one that no object has marks nothing and is left out. Values at invalid steps (-10000)
+are zeros here. Files of the converter's first versions, which lack `metadata`, ids and
+`map_element_id`, are read too: there the SDC is the last object (WOMD puts it there),
+headings are degrees if one exceeds a full turn in radians, and a road's kind follows
+from its `type`.
 """
 
 import math
@@ -33,7 +35,7 @@ from sim.scene import (
     no_lights,
 )
 from sim.validate import check_scene
-from sim.womd import open_polygon
+from sim.womd import each_once, open_polygon, rows_of
 
 _DT = 0.1  # s
 _CURRENT_STEP = 10
@@ -111,6 +113,7 @@ class _Metadata(msgspec.Struct, frozen=True):
 
     sdc_track_index: int
     tracks_to_predict: list[_Prediction] = []
+    objects_of_interest: list[_Id] = []
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -141,6 +144,7 @@ def parse_gpudrive(text: bytes, *, source: str) -> Scene:
     if not steps:
         raise SceneError(f"{source}: object 0 has no steps")
     states = _states(file, steps, source)
+    object_ids = [i if o.id is None else o.id for i, o in enumerate(file.objects)]
     metadata = file.metadata or _Metadata(sdc_track_index=len(file.objects) - 1)
     return check_scene(
         Scene(
@@ -148,10 +152,7 @@ def parse_gpudrive(text: bytes, *, source: str) -> Scene:
             dt=_DT,
             current_step=max(min(_CURRENT_STEP, steps - 2), 0),
             sdc_index=metadata.sdc_track_index,
-            object_ids=np.array(
-                [i if o.id is None else o.id for i, o in enumerate(file.objects)],
-                np.int64,
-            ),
+            object_ids=np.array(object_ids, np.int64),
             object_types=np.array(
                 [_object_type(o.type, source) for o in file.objects], np.int64
             ),
@@ -162,7 +163,10 @@ def parse_gpudrive(text: bytes, *, source: str) -> Scene:
             valid=states[..., 0] > 0,
             roads=tuple(_road(r, source) for r in file.roads if r.geometry),
             lights=_lights(file.tl_states, steps, source),
-            tracks_to_predict=tuple(p.track_index for p in metadata.tracks_to_predict),
+            tracks_to_predict=each_once(
+                p.track_index for p in metadata.tracks_to_predict
+            ),
+            objects_of_interest=rows_of(metadata.objects_of_interest, object_ids),
             source=source,
         )
     )

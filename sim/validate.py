@@ -36,6 +36,7 @@ def _problems(scene: Scene) -> Iterator[str]:
     yield from _index_problems(scene)
     yield from _state_problems(scene)
     yield from _map_problems(scene)
+    yield from _path_problems(scene)
     yield from _light_problems(scene)
 
 
@@ -76,6 +77,10 @@ def _index_problems(scene: Scene) -> Iterator[str]:
         *(
             ("track to predict", index, scene.objects, "objects")
             for index in scene.tracks_to_predict
+        ),
+        *(
+            ("object of interest", index, scene.objects, "objects")
+            for index in scene.objects_of_interest
         ),
     )
     for name, index, count, of in indices:
@@ -126,6 +131,15 @@ def _map_problems(scene: Scene) -> Iterator[str]:
             yield f"map feature {index} has a point that is not finite"
         elif not (math.isfinite(road.speed_limit) and road.speed_limit >= 0):
             yield f"map feature {index} has speed limit {road.speed_limit}"
+
+
+def _path_problems(scene: Scene) -> Iterator[str]:
+    """Whether every path sample leads from one finite point to another."""
+    for index, path in enumerate(scene.sdc_paths):
+        if path.points.ndim != 2 or path.points.shape[1:] != (3,):
+            yield f"SDC path {index} has points of shape {path.points.shape}"
+        elif len(path.points) < 2 or not _within(path.points, _POSITION_LIMIT).all():
+            yield f"SDC path {index} has a point that is not finite, or fewer than two"
 
 
 def _light_problems(scene: Scene) -> Iterator[str]:

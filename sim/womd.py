@@ -9,10 +9,13 @@ Departures: the step length is the mean of the timestamps' differences rounded t
 millisecond, since the recorded ones jitter by less; a lane, line, edge or light of a
 type newer than the table is read as that feature's unknown type, a map feature of an
 unknown kind or without points is left out; a light that is not reported at a step is
-`LightState.UNKNOWN` there, and its stop point is the first one reported.
+`LightState.UNKNOWN` there, and its stop point is the first one reported. Objects of
+interest are ids in the file: one that no track has marks nothing and is left out. The
+message has no field for the SDC's path samples of release 1.3.1, which come in the
+flat form only (`sim.womd_example`).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -51,7 +54,7 @@ MESSAGES = build_messages(
         ),
         "RoadLine": (("type", 1, "int32"), ("polyline", 2, "MapPoint*")),
         "RoadEdge": (("type", 1, "int32"), ("polyline", 2, "MapPoint*")),
-        "StopSign": (("position", 2, "MapPoint"),),
+        "StopSign": (("lane", 1, "int64*"), ("position", 2, "MapPoint")),
         "Crosswalk": (("polygon", 1, "MapPoint*"),),
         "SpeedBump": (("polygon", 1, "MapPoint*"),),
         "Driveway": (("polygon", 1, "MapPoint*"),),
@@ -92,6 +95,7 @@ MESSAGES = build_messages(
         "Scenario": (
             ("timestamps_seconds", 1, "double*"),
             ("tracks", 2, "Track*"),
+            ("objects_of_interest", 4, "int32*"),
             ("scenario_id", 5, "bytes"),
             ("sdc_track_index", 6, "int32"),
             ("dynamic_map_states", 7, "DynamicMapState*"),
@@ -125,13 +129,14 @@ def parse_scenario(payload: bytes, *, source: str) -> Scene:
     if not scenario.tracks:
         raise SceneError(f"{source}: not a WOMD Scenario message, or without tracks")
     states = _states(scenario, source)
+    object_ids = [track.id for track in scenario.tracks]
     return check_scene(
         Scene(
             scenario_id=scenario.scenario_id.decode("utf-8", "replace"),
             dt=_step_length(scenario, source),
             current_step=scenario.current_time_index,
             sdc_index=scenario.sdc_track_index,
-            object_ids=np.array([t.id for t in scenario.tracks], np.int64),
+            object_ids=np.array(object_ids, np.int64),
             object_types=_object_types(scenario, source),
             position=states[..., 1:4],
             yaw=states[..., 7],
@@ -140,10 +145,26 @@ def parse_scenario(payload: bytes, *, source: str) -> Scene:
             valid=states[..., 0] > 0,
             roads=tuple(_roads(scenario.map_features)),
             lights=_lights(scenario),
-            tracks_to_predict=tuple(p.track_index for p in scenario.tracks_to_predict),
+            tracks_to_predict=each_once(
+                p.track_index for p in scenario.tracks_to_predict
+            ),
+            objects_of_interest=rows_of(scenario.objects_of_interest, object_ids),
             source=source,
         )
     )
+
+
+def each_once(rows: Iterable[int]) -> tuple[int, ...]:
+    """The rows in order, each once: one listed twice is not to be controlled twice."""
+    return tuple(dict.fromkeys(rows))
+
+
+def rows_of(ids: Iterable[int], object_ids: Sequence[int]) -> tuple[int, ...]:
+    """The rows of the objects with these ids; an id that no object has has none."""
+    row_of: dict[int, int] = {}
+    for row, object_id in enumerate(object_ids):
+        row_of.setdefault(object_id, row)
+    return each_once(row_of[i] for i in ids if i in row_of)
 
 
 def _step_length(scenario: _Proto, source: str) -> float:
@@ -214,8 +235,10 @@ def _road(feature: _Proto) -> Polyline | None:
             points = _points(getattr(feature, name).polygon)
             return Polyline(kind, open_polygon(points), feature.id)
     if feature.HasField("stop_sign"):
-        points = _points([feature.stop_sign.position])
-        return Polyline(RoadKind.STOP_SIGN, points, feature.id)
+        sign = feature.stop_sign
+        points = _points([sign.position])
+        lanes = tuple(sign.lane)
+        return Polyline(RoadKind.STOP_SIGN, points, feature.id, stop_lanes=lanes)
     return None
 
 

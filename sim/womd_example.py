@@ -2,15 +2,18 @@
 
 A record is a dictionary of flat arrays: `state/{past,current,future}/*` for 128 object
 slots, `roadgraph_samples/*` for up to 20,000 map points and
-`traffic_light_state/{past,current,future}/*` for 16 light slots a step. Field numbers
+`traffic_light_state/{past,current,future}/*` for 16 light slots a step; from release
+1.3.1 on `path_samples/*`, the ways that the SDC could have gone. Field numbers
 are those of TensorFlow's public `example.proto` and `feature.proto`; names, shapes and
 type numbers (those of `RoadKind`) are the data set's. Units and frames are as in
 `sim.womd`, and road edges have the drivable side on their left.
 
 Departures: the step is 0.1 s; slots that are never valid are left out, and so are
 features other than those named below. Consecutive map points of one id and type are
-one polyline: the form keeps neither lane connections nor speed limits. Where several
-slots name one lane at a step, the last one counts.
+one polyline: the form keeps neither lane connections nor speed limits, nor the lanes
+of stop signs. Where several slots name one lane at a step, the last one counts. There
+are as many paths as on-route flags; of each its valid points, in the file's order, are
+kept, and one of fewer than two leads nowhere and is left out.
 """
 
 import itertools
@@ -23,6 +26,7 @@ from jaxtyping import Bool, Float
 
 from sim.protobuf import build_messages
 from sim.scene import (
+    LanePath,
     LightState,
     ObjectType,
     Polyline,
@@ -93,6 +97,7 @@ def parse_example(payload: bytes, *, source: str) -> Scene:
     kept = np.flatnonzero((states[..., 0] > 0).any(axis=1))
     states = states[kept]
     states[states[..., 0] <= 0] = 0.0
+    interest = "state/objects_of_interest"  # not in the first releases
     past = _get(features, "state/past/x", source).size // max(slots, 1)
     return check_scene(
         Scene(
@@ -114,6 +119,10 @@ def parse_example(payload: bytes, *, source: str) -> Scene:
             tracks_to_predict=_flagged(
                 features, "state/tracks_to_predict", kept, source
             ),
+            objects_of_interest=_flagged(features, interest, kept, source)
+            if interest in features
+            else (),
+            sdc_paths=_paths(features, source),
             source=source,
         )
     )
@@ -242,6 +251,31 @@ def _roads(features: _Features, source: str) -> tuple[Polyline, ...]:
         Polyline(RoadKind(int(kinds[start])), points[start:end], int(ids[start]))
         for start, end in itertools.pairwise(bounds)
         if end > start
+    )
+
+
+def _paths(features: _Features, source: str) -> tuple[LanePath, ...]:
+    """The SDC's path samples; none where the record is of a release without."""
+    group = "path_samples"
+    if f"{group}/xyz" not in features:
+        return ()
+    xyz = _get(features, f"{group}/xyz", source).astype(np.float64)
+    on_route, valid = (
+        _ints(values, values.size, name, source)
+        for name in (f"{group}/on_route", f"{group}/valid")
+        for values in (_get(features, name, source),)
+    )
+    paths = on_route.size
+    if not paths or valid.size % paths or xyz.size != 3 * valid.size:
+        raise SceneError(
+            f"{source}: {group} has {paths} on-route flags, {valid.size} valid flags "
+            f"and {xyz.size} coordinates, which do not divide into paths"
+        )
+    points, use = xyz.reshape(paths, -1, 3), valid.reshape(paths, -1) > 0
+    return tuple(
+        LanePath(points[path, use[path]], bool(on_route[path] == 1))
+        for path in range(paths)
+        if use[path].sum() > 1
     )
 
 

@@ -18,6 +18,7 @@ def scenario(*, objects: int = 2, steps: int = 12, name: str = "abc") -> Any:
     message.current_time_index = min(10, steps - 1)
     message.sdc_track_index = objects - 1
     message.tracks_to_predict.add(track_index=0)
+    message.objects_of_interest.extend([100 + objects - 1, 100])
     for index in range(objects):
         _add_track(message, index, steps)
     _add_map(message)
@@ -64,6 +65,7 @@ def _add_map(message: Any) -> None:
         line.polyline.add(x=x, y=1.75, z=0.0)
     sign = message.map_features.add(id=4).stop_sign
     sign.position.x, sign.position.y = 30.0, -3.0
+    sign.lane.append(1)
     for index, kind in enumerate(("crosswalk", "speed_bump", "driveway")):
         feature = getattr(message.map_features.add(id=5 + index), kind)
         for x, y in (*corners, corners[0]):
@@ -126,6 +128,7 @@ def gpudrive(*, objects: int = 2, steps: int = 12) -> dict[str, Any]:
         "metadata": {
             "sdc_track_index": objects - 1,
             "tracks_to_predict": [{"track_index": 0, "difficulty": 0}],
+            "objects_of_interest": [100 + objects - 1, 100],
         },
     }
 
@@ -144,6 +147,7 @@ def example(*, slots: int = 3, past: int = 2, future: int = 3) -> dict[str, Any]
         "state/type": [1.0] * cars + [-1.0],
         "state/is_sdc": [0] * (cars - 1) + [1, -1],
         "state/tracks_to_predict": [1] + [0] * (cars - 1) + [-1],
+        "state/objects_of_interest": [1] * cars + [-1],
         "roadgraph_samples/valid": [1, 1, 1, 1, 0],
         "roadgraph_samples/id": [2, 2, 2, 3, -1],
         "roadgraph_samples/type": [16, 16, 16, 7, -1],
@@ -179,6 +183,20 @@ def example(*, slots: int = 3, past: int = 2, future: int = 3) -> dict[str, Any]
         for axis, value in (("x", 30.0), ("y", 0.0), ("z", 0.0)):
             features[f"{group}/{axis}"] = [value for _ in steps for _ in (0, 1)]
     return features
+
+
+def with_paths(features: dict[str, Any]) -> dict[str, Any]:
+    """Adds path samples: one on the route, one off it, an empty slot; 3 points each."""
+    xs = (0.0, 10.0, 20.0)
+    valid = [[1, 1, 0], [1, 1, 1], [0, 0, 0]]
+    points = [(x, 3.5 * lane, 1.0) for lane in range(3) for x in xs]
+    return features | {
+        "path_samples/xyz": [value for point in points for value in point],
+        "path_samples/valid": [flag for path in valid for flag in path],
+        "path_samples/id": [1] * 3 + [7] * 3 + [-1] * 3,
+        "path_samples/arc_length": [*xs, *xs, *xs],
+        "path_samples/on_route": [1, 0, -1],
+    }
 
 
 def encode_example(features: dict[str, Any]) -> bytes:

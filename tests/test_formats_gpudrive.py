@@ -59,6 +59,7 @@ def test_every_field_arrives() -> None:
     np.testing.assert_allclose(scene.velocity[0, 3], [5.0, 0.0])
     np.testing.assert_allclose(scene.size[0, 0], [4.5, 2.0, 1.5])
     assert scene.tracks_to_predict == (0,)
+    assert scene.objects_of_interest == (1, 0)
     edge, sign = scene.roads
     assert (edge.kind, edge.feature_id) == (RoadKind.EDGE_MEDIAN, 2)
     assert (sign.kind, len(sign.points)) == (RoadKind.STOP_SIGN, 1)

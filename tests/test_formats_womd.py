@@ -43,6 +43,10 @@ def test_the_real_scenario(scenes_data: Path) -> None:
     # 1,092 states are 12 lights at each of 91 steps.
     assert scene.lights.states.shape == (12, 91)
     ids = {lane.feature_id for lane in lanes}
+    signs = [road for road in scene.roads if road.kind is RoadKind.STOP_SIGN]
+    named = [lane for sign in signs for lane in sign.stop_lanes]
+    assert len(named) == 8 and set(named) <= ids  # five signs name none
+    assert scene.sdc_paths == ()
     assert set(scene.lights.lane_ids.tolist()) <= ids
 
 
@@ -80,6 +84,7 @@ def test_every_field_arrives() -> None:
     np.testing.assert_allclose(scene.velocity[0, 3], [5.0, 0.0])
     np.testing.assert_allclose(scene.size[0, 0], [4.5, 2.0, 1.5])
     assert scene.tracks_to_predict == (0,)
+    assert scene.objects_of_interest == (1, 0)
     assert scene.lights.lane_ids.tolist() == [1]
     assert scene.lights.states[0, :3].tolist() == [LightState.STOP, 0, LightState.STOP]
     np.testing.assert_allclose(scene.lights.stop_points, [[30.0, 0.0, 0.0]])
@@ -98,9 +103,20 @@ def test_every_map_feature_arrives() -> None:
         7: RoadKind.DRIVEWAY,
     }
     assert (roads[1].entry_lanes, roads[1].exit_lanes) == ((7,), (8, 9))
+    assert roads[4].stop_lanes == (1,)
     assert roads[1].speed_limit == pytest.approx(11.176)  # 25 mph
     assert roads[2].points.tolist() == [[-10, -2, 0], [30, -2, 0], [60, -2, 0]]
     assert len(roads[5].points) == 4  # the closing point is not repeated
+
+
+def test_ids_of_interest_that_no_track_has_are_left_out() -> None:
+    message = records.scenario()
+    del message.objects_of_interest[:]
+    message.objects_of_interest.extend([7, 101, 101])
+    message.tracks_to_predict.add(track_index=0)
+    scene = _parse(message)
+    assert scene.objects_of_interest == (1,)
+    assert scene.tracks_to_predict == (0,)  # named twice, controlled once
 
 
 def test_invalid_states_are_masked() -> None:
@@ -229,6 +245,8 @@ def test_every_feature_of_an_example_arrives() -> None:
     assert (scene.objects, scene.steps, scene.current_step) == (2, 6, 2)
     assert scene.sdc_index == 1
     assert scene.tracks_to_predict == (0,)
+    assert scene.objects_of_interest == (0, 1)
+    assert scene.sdc_paths == ()
     assert scene.object_ids.tolist() == [100, 101]
     np.testing.assert_allclose(scene.position[1, 4], [2.0, 3.5, 1.0])
     np.testing.assert_allclose(scene.velocity[1, 4], [5.0, 0.0])
@@ -242,11 +260,38 @@ def test_every_feature_of_an_example_arrives() -> None:
     assert scene.lights.states.tolist() == [[LightState.STOP] * 6]
 
 
-@pytest.mark.parametrize("name", sorted(records.example()))
+def test_path_samples_arrive() -> None:
+    """Valid points only; a slot without any is no path."""
+    features = records.with_paths(records.example())
+    scene = parse_example(records.encode_example(features), source="made")
+    on, off = scene.sdc_paths
+    assert (on.on_route, off.on_route) == (True, False)
+    assert on.points.tolist() == [[0, 0, 1], [10, 0, 1]]
+    assert off.points.tolist() == [[0, 3.5, 1], [10, 3.5, 1], [20, 3.5, 1]]
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "problem"),
+    [
+        ("xyz", [0.0] * 24, "do not divide into paths"),
+        ("valid", [1] * 8, "do not divide into paths"),
+        ("on_route", [], "no numbers under 'path_samples/on_route'"),
+        ("xyz", [float("nan")] * 27, "SDC path 0 has a point that is not finite"),
+    ],
+)
+def test_broken_path_samples_are_named(name: str, values: list, problem: str) -> None:
+    features = records.with_paths(records.example())
+    del features[f"path_samples/{name}"]
+    features |= {f"path_samples/{name}": values} if values else {}
+    with pytest.raises(SceneError, match=problem):
+        parse_example(records.encode_example(features), source="here")
+
+
+@pytest.mark.parametrize("name", sorted(records.with_paths(records.example())))
 def test_each_feature_of_an_example_is_needed_whole(name: str) -> None:
     """Without it, or with a value less, no other error than SceneError."""
     for change in ("gone", "short", "text", "nan"):
-        features = records.example()
+        features = records.with_paths(records.example())
         values = features.pop(name)
         if change == "short":
             features[name] = values[:-1]
@@ -259,9 +304,19 @@ def test_each_feature_of_an_example_is_needed_whole(name: str) -> None:
         except SceneError as error:
             assert str(error).startswith("here: ")
         else:
-            # The future (as in the test split) and lights may be missing.
+            # The future (as in the test split), lights and paths may be missing.
             missing = name.startswith(("state/future/x", "traffic_light_state"))
-            assert missing or (name, change) == ("scenario/id", "short")
+            unread = name in ("path_samples/id", "path_samples/arc_length")
+            assert (
+                missing
+                or unread
+                or (name, change)
+                in (
+                    ("scenario/id", "short"),
+                    ("state/objects_of_interest", "gone"),
+                    ("path_samples/xyz", "gone"),
+                )
+            )
 
 
 def test_the_two_messages_are_told_apart() -> None:
