@@ -16,13 +16,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from actors.network import NetworkConfig, batched
 from sim import metrics
 from sim.bank import Bank
-from sim.environment import (
-    EnvironmentConfig,
-    State,
-    auto_reset,
-    random_start,
-    step,
-)
+from sim.environment import EnvironmentConfig, State, step
+from sim.episodes import auto_reset, draw, episode_over, sdc_only, starts
 from sim.observation import ObservationSizes, observation_sizes, observe_batch
 
 
@@ -88,10 +83,8 @@ def start(
     key: PRNGKeyArray, bank: Bank, environments: int, config: EnvironmentConfig
 ) -> Running:
     """M random scenes from their starts."""
-    keys = jax.random.split(key, environments)
-    state = jax.vmap(lambda one: random_start(one, bank, config))(keys)
     return Running(
-        state=state,
+        state=draw(key, starts(bank, sdc_only, config), environments),
         score=jnp.zeros(environments),
         failed=jnp.zeros(environments, bool),
     )
@@ -107,8 +100,10 @@ def act(
 ) -> tuple[Running, Transitions]:
     """K steps of all environments. Compile with `config` static."""
 
+    begin = starts(bank, sdc_only, config.environment)
+
     def one(carry: Running, step_key: PRNGKeyArray) -> tuple[Running, Transitions]:
-        return _step(step_key, bank, vector, carry, epsilon, config)
+        return _step(step_key, bank, begin, vector, carry, epsilon, config)
 
     return jax.lax.scan(one, running, jax.random.split(key, config.scan_steps))
 
@@ -116,6 +111,7 @@ def act(
 def _step(
     key: PRNGKeyArray,
     bank: Bank,
+    begin: State,
     vector: Float[Array, " parameters"],
     running: Running,
     epsilon: Float[Array, " environments"],
@@ -123,15 +119,8 @@ def _step(
 ) -> tuple[Running, Transitions]:
     state, environment = running.state, config.environment
     explore_key, random_key, reset_key = jax.random.split(key, 3)
-    observation = observe_batch(
-        bank,
-        state.scene,
-        state.step,
-        state.controlled[:, 0],
-        state.history[:, 0],
-        state.history_valid[:, 0],
-        environment.observation,
-    )
+    observation = observe_batch(bank, state.view, environment.observation)
+    observation = jax.tree.map(lambda values: values[:, 0], observation)
     actions = environment.action.count
     q_values = batched(
         vector, observation, config=config.network, sizes=config.sizes, actions=actions
@@ -145,12 +134,9 @@ def _step(
     )
     score = running.score + outcome.reward[:, 0]
     failed = running.failed | outcome.overlap[:, 0] | outcome.offroad[:, 0]
-    over = outcome.truncated | outcome.terminated[:, 0]
+    over = episode_over(outcome)
     progress = jax.vmap(metrics.progress, in_axes=(None, 0, 0, 0))(
         bank, state_t.scene, state_t.controlled[:, 0], state_t.along[:, 0]
-    )
-    fresh = jax.vmap(auto_reset, in_axes=(0, None, 0, 0, None))(
-        jax.random.split(reset_key, over.shape[0]), bank, state_t, outcome, environment
     )
     transitions = Transitions(
         scene=state.scene,
@@ -172,7 +158,7 @@ def _step(
         q_values=q_values[: config.watched],
     )
     after = Running(
-        state=fresh,
+        state=auto_reset(reset_key, begin, state_t, outcome),
         score=jnp.where(over, 0.0, score),
         failed=failed & ~over,
     )

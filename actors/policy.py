@@ -143,15 +143,9 @@ def greedy(
     actions = config.action.count
 
     def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
-        objects = state.controlled.shape[0]
-        observation: Observation = observe_batch(
-            bank,
-            jnp.broadcast_to(state.scene, (objects,)),
-            jnp.broadcast_to(state.step, (objects,)),
-            state.controlled,
-            state.history,
-            state.history_valid,
-            config.observation,
+        one = jax.tree.map(lambda value: value[None], state.view)
+        observation: Observation = jax.tree.map(
+            lambda values: values[0], observe_batch(bank, one, config.observation)
         )
         q_values = batched(
             vector, observation, config=network, sizes=sizes, actions=actions

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from replay.spec import Field, RowSpec
 from sim.bank import Bank
 from sim.observation import Observation, ObservationConfig, observe_batch
+from sim.world import View
 
 
 def row_spec(history: int) -> RowSpec:
@@ -66,16 +67,22 @@ def render(
     Bit for bit those that the actor acted on: `observe_batch` is the same program
     whatever surrounds it (tested).
     """
-    both = observe_batch(
-        bank,
-        jnp.concatenate([columns.scene, columns.scene]),
-        jnp.concatenate([columns.step - 1, columns.step]),
-        jnp.concatenate([columns.controlled, columns.controlled]),
-        jnp.concatenate([columns.states[:, :-1], columns.states[:, 1:]]),
-        jnp.concatenate([columns.valid[:, :-1], columns.valid[:, 1:]]),
-        config,
+    states, valid = jnp.asarray(columns.states), jnp.asarray(columns.valid)
+    before = View(
+        scene=jnp.asarray(columns.scene),
+        step=jnp.asarray(columns.step) - 1,
+        controlled=jnp.asarray(columns.controlled)[:, None],
+        history=states[:, None, :-1],
+        history_valid=valid[:, None, :-1],
     )
+    after = before._replace(
+        step=jnp.asarray(columns.step),
+        history=states[:, None, 1:],
+        history_valid=valid[:, None, 1:],
+    )
+    both = jax.tree.map(lambda *parts: jnp.concatenate(parts), before, after)
+    seen = observe_batch(bank, both, config)
     batch = columns.scene.shape[0]
-    first = jax.tree.map(lambda values: values[:batch], both)
-    second = jax.tree.map(lambda values: values[batch:], both)
+    first = jax.tree.map(lambda values: values[:batch, 0], seen)
+    second = jax.tree.map(lambda values: values[batch:, 0], seen)
     return first, second

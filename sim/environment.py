@@ -16,7 +16,9 @@ the recording's end, after which there was more to come: only the first has disc
 The paper does not say whether a failure ends an episode.
 
 Heights are not simulated: an object has its log's height of the same step. Where the
-controlled object was not recorded at t-1 and t it follows the log.
+controlled object was not recorded at t-1 and t it follows the log. Controlled objects
+are seen and judged where they are simulated, also by one another. Slots of `controlled`
+may be empty (`sim.world`): they are never valid and never fail.
 """
 
 from dataclasses import dataclass, field
@@ -24,12 +26,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
 
 from sim import metrics
 from sim.bank import Bank
 from sim.dynamics import ActionConfig, ObjectState, apply_discrete
 from sim.observation import Observation, ObservationConfig, observe
+from sim.world import View, exists, row_of
 
 
 @dataclass(frozen=True)
@@ -59,10 +62,17 @@ class State(NamedTuple):
 
     scene: Int[Array, ""]  # row of the bank
     step: Int[Array, ""]  # of the recording
-    controlled: Int[Array, " controlled"]  # rows of the log's objects
+    controlled: Int[Array, " controlled"]  # rows of the log's objects, or its length
     history: Float[Array, "controlled history 5"]  # x, y, yaw, v_x, v_y; oldest first
     history_valid: Bool[Array, "controlled history"]
     along: Float[Array, " controlled"]  # m, arc length on the logged route
+
+    @property
+    def view(self) -> View:
+        """What is observed of it."""
+        return View(
+            self.scene, self.step, self.controlled, self.history, self.history_valid
+        )
 
 
 class Outcome(NamedTuple):
@@ -76,15 +86,40 @@ class Outcome(NamedTuple):
     valid: Bool[Array, " controlled"]  # recorded at this step: it counts
 
 
+class Judgement(NamedTuple):
+    """The benchmark's metrics of the controlled objects at one step.
+
+    Where an object was not recorded at this step they are False and 0; infeasible is
+    only what was recorded at the step before, too.
+    """
+
+    overlap: Bool[Array, " controlled"]
+    offroad: Bool[Array, " controlled"]
+    log_divergence: Float[Array, " controlled"]  # m
+    kinematic_infeasibility: Bool[Array, " controlled"]
+
+
 def logged_states(
     bank: Bank,
     scene: Int[Array, ""],
     step: Int[Array, ""],
     controlled: Int[Array, " controlled"],
 ) -> Float[Array, "controlled 5"]:
-    """States (x, y, yaw, v_x, v_y) of the log."""
-    row = bank.log[scene, step, controlled]
-    return jnp.stack([row[:, 0], row[:, 1], row[:, 3], row[:, 4], row[:, 5]], -1)
+    """States (x, y, yaw, v_x, v_y) of the log; 0 in an empty slot."""
+    row = bank.log[scene, step, row_of(bank, controlled)]
+    state = jnp.stack([row[:, 0], row[:, 1], row[:, 3], row[:, 4], row[:, 5]], -1)
+    return jnp.where(exists(bank, controlled)[:, None], state, 0.0)
+
+
+def recorded(
+    bank: Bank,
+    scene: Int[Array, ""],
+    step: Int[Array, ""],
+    controlled: Int[Array, " controlled"],
+) -> Bool[Array, " controlled"]:
+    """Whether the log has the objects at this step."""
+    valid = bank.log_valid[scene, step, row_of(bank, controlled)]
+    return valid & exists(bank, controlled)
 
 
 def current_objects(
@@ -93,7 +128,7 @@ def current_objects(
     """All objects' states now, and which are there: simulated where controlled."""
     row = bank.log[state.scene, state.step]
     logged = jnp.stack([row[:, 0], row[:, 1], row[:, 3], row[:, 4], row[:, 5]], -1)
-    now = logged.at[state.controlled].set(state.history[:, -1])
+    now = logged.at[state.controlled].set(state.history[:, -1], mode="drop")
     return now, bank.log_valid[state.scene, state.step]
 
 
@@ -117,20 +152,17 @@ def start_at(
     """The scene at any recorded step; history before step 0 is not valid."""
     wanted = step - jnp.arange(config.observation.history - 1, -1, -1)
     steps = jnp.maximum(wanted, 0)
-    history = jax.vmap(logged_states, in_axes=(None, None, 0, None), out_axes=1)(
-        bank, scene, steps, controlled
-    )
-    recorded = bank.log_valid[scene, steps[None], controlled[:, None]]
-    position = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
-        bank, scene, controlled, history[:, -1, 0], history[:, -1, 1]
-    )
+    axes = (None, None, 0, None)
+    history = jax.vmap(logged_states, axes, 1)(bank, scene, steps, controlled)
+    valid = jax.vmap(recorded, axes, 1)(bank, scene, steps, controlled)
+    now = history[:, -1]
     return State(
         scene=scene,
         step=step,
         controlled=controlled,
         history=history,
-        history_valid=recorded & (wanted >= 0)[None],
-        along=position.along,
+        history_valid=valid & (wanted >= 0)[None],
+        along=_position(bank, scene, controlled, now).along,
     )
 
 
@@ -155,19 +187,15 @@ def advance(
 ) -> tuple[State, Outcome]:
     """Puts the controlled objects where their dynamics (any) say, and judges it."""
     step_t = jnp.minimum(state.step + 1, bank.log.shape[1] - 1)
-    recorded = bank.log_valid[state.scene, :, state.controlled]
-    follows = recorded[:, state.step] & recorded[:, step_t]
+    valid = recorded(bank, state.scene, step_t, state.controlled)
+    follows = state.history_valid[:, -1] & valid
     now = jnp.where(
         follows[:, None],
         moved,
         logged_states(bank, state.scene, step_t, state.controlled),
     )
-    valid = recorded[:, step_t]
     overlap, offroad = failures(bank, state.scene, step_t, state.controlled, now)
-    overlap, offroad = overlap & valid, offroad & valid
-    position = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
-        bank, state.scene, state.controlled, now[:, 0], now[:, 1]
-    )
+    position = _position(bank, state.scene, state.controlled, now)
     gained = _credit(bank, state.scene, step_t, state.controlled, position.along)
     gained -= _credit(bank, state.scene, state.step, state.controlled, state.along)
     near = jnp.maximum(1.0 - (position.aside / config.progress_width) ** 2, 0.0)
@@ -203,11 +231,21 @@ def _credit(
     along: Float[Array, " controlled"],
 ) -> Float[Array, " controlled"]:
     """Metres along the routes, less those ahead of where the log was at the step."""
-    row = bank.log[scene, step, controlled]
-    logged = jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
-        bank, scene, controlled, row[:, 0], row[:, 1]
-    ).along
-    return along - 2.0 * jnp.maximum(along - logged, 0.0)
+    logged = logged_states(bank, scene, step, controlled)
+    ahead = along - _position(bank, scene, controlled, logged).along
+    return along - 2.0 * jnp.maximum(ahead, 0.0)
+
+
+def _position(
+    bank: Bank,
+    scene: Int[Array, ""],
+    controlled: Int[Array, " controlled"],
+    state: Float[Array, "controlled 5"],
+) -> metrics.RoutePosition:
+    """Where the objects are on their routes."""
+    return jax.vmap(metrics.route_position, in_axes=(None, None, 0, 0, 0))(
+        bank, scene, row_of(bank, controlled), state[:, 0], state[:, 1]
+    )
 
 
 def failures(
@@ -219,53 +257,44 @@ def failures(
 ) -> tuple[Bool[Array, " controlled"], Bool[Array, " controlled"]]:
     """Overlap and off-road of the controlled objects, the others where the log is."""
     row = bank.log[scene, step_t]
+    own = row_of(bank, controlled)
     boxes = metrics.Box(
-        x=row[:, 0].at[controlled].set(now[:, 0]),
-        y=row[:, 1].at[controlled].set(now[:, 1]),
-        yaw=row[:, 3].at[controlled].set(now[:, 2]),
+        x=row[:, 0].at[controlled].set(now[:, 0], mode="drop"),
+        y=row[:, 1].at[controlled].set(now[:, 1], mode="drop"),
+        yaw=row[:, 3].at[controlled].set(now[:, 2], mode="drop"),
         length=row[:, 6],
         width=row[:, 7],
     )
     valid = bank.log_valid[scene, step_t]
-    overlap = jax.vmap(metrics.overlap, in_axes=(0, None, None))(
-        controlled, boxes, valid
-    )
-    own = metrics.Box(*(value[controlled] for value in boxes))
+    overlap = jax.vmap(metrics.overlap, in_axes=(0, None, None))(own, boxes, valid)
     offroad = jax.vmap(metrics.offroad, in_axes=(None, None, 0, 0))(
-        bank, scene, own, row[controlled, 2]
+        bank, scene, metrics.Box(*(value[own] for value in boxes)), row[own, 2]
     )
-    return overlap, offroad
+    there = recorded(bank, scene, step_t, controlled)
+    return overlap & there, offroad & there
 
 
-def observe_state(
-    bank: Bank, state: State, index: int, config: EnvironmentConfig
-) -> Observation:
-    """What the controlled object of slot `index` sees."""
-    return observe(
-        bank,
-        state.scene,
-        state.step,
-        state.controlled[index],
-        state.history[index],
-        state.history_valid[index],
-        config.observation,
+def judge(bank: Bank, state_tm1: State, state_t: State, dt: float) -> Judgement:
+    """All metrics of the step that led from one state to the next, `dt` seconds."""
+    before, now = state_tm1.history[:, -1], state_t.history[:, -1]
+    place = (bank, state_t.scene, state_t.step, state_t.controlled)
+    valid = recorded(*place)
+    overlap, offroad = failures(*place, now)
+    logged = logged_states(*place)
+    divergence = jax.vmap(metrics.log_divergence)(
+        now[:, 0], now[:, 1], logged[:, 0], logged[:, 1]
+    )
+    infeasible = jax.vmap(metrics.kinematic_infeasibility, in_axes=(0, 0, None))(
+        ObjectState(*before.T), ObjectState(*now.T), dt
+    )
+    return Judgement(
+        overlap=overlap,
+        offroad=offroad,
+        log_divergence=jnp.where(valid, divergence, 0.0),
+        kinematic_infeasibility=infeasible & valid & state_tm1.history_valid[:, -1],
     )
 
 
-def auto_reset(
-    key: PRNGKeyArray,
-    bank: Bank,
-    state: State,
-    outcome: Outcome,
-    config: EnvironmentConfig,
-) -> State:
-    """A random scene's start, with its SDC controlled, where the episode is over."""
-    over = outcome.truncated | outcome.terminated.all()
-    fresh = random_start(key, bank, config)
-    return jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, state)
-
-
-def random_start(key: PRNGKeyArray, bank: Bank, config: EnvironmentConfig) -> State:
-    """A random scene from its start, with its SDC controlled."""
-    scene = jax.random.randint(key, (), 0, bank.sdc.shape[0])
-    return reset(bank, scene, bank.sdc[scene][None], config)
+def observe_state(bank: Bank, state: State, config: EnvironmentConfig) -> Observation:
+    """What each controlled object sees; axis `controlled` in front."""
+    return observe(bank, state.view, config.observation)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sim.bank import Bank
 from sim.metrics import route_position
 from sim.scene import LightState
+from sim.world import World
 
 POSITION_SCALE = 30.0  # m
 SPEED_SCALE = 15.0  # m/s
@@ -43,18 +44,14 @@ class Frame(NamedTuple):
 
 
 def own_features(
-    bank: Bank,
-    scene: Int[Array, ""],
-    step: Int[Array, ""],
-    controlled: Int[Array, ""],
     history: Float[Array, "history 5"],
     history_valid: Bool[Array, " history"],
+    size: Float[Array, "2"],
     frame: Frame,
 ) -> Float[Array, " own"]:
     """Its speed, size and turning, then the past poses, oldest first."""
     now = history[-1]
     speed = jnp.hypot(now[3], now[4])
-    size = bank.log[scene, step, controlled, 6:8]
     past = history[:-1]
     past_valid = history_valid[:-1].astype(jnp.float32)
     x, y = frame.place(past[:, 0], past[:, 1])
@@ -118,30 +115,24 @@ def route_features(
 
 
 def agent_features(
-    bank: Bank,
-    scene: Int[Array, ""],
-    step: Int[Array, ""],
-    controlled: Int[Array, ""],
+    world: World,
+    kind: Int[Array, " objects"],
+    own: Int[Array, ""],
     frame: Frame,
-    history: int,
     neighbours: int,
-    radius: float,
+    radius: Float[Array, ""],
 ) -> tuple[Float[Array, "neighbours agent"], Bool[Array, " neighbours"]]:
-    """The nearest valid others within `radius`, and which slots they fill."""
-    x, y = bank.log[scene, step, :, 0] - frame.x, bank.log[scene, step, :, 1] - frame.y
+    """The valid others nearest to object `own` within `radius`, and their slots."""
+    x, y = world.state[-1, :, 0] - frame.x, world.state[-1, :, 1] - frame.y
     squared = x * x + y * y
-    objects = squared.shape[0]
-    seen = bank.log_valid[scene, step] & (squared < radius**2)
-    seen = seen & (jnp.arange(objects) != controlled)
+    seen = world.valid[-1] & (squared < radius**2)
+    seen = seen & (jnp.arange(squared.shape[0]) != own)
     chosen, valid = nearest(squared, seen, neighbours)
-    steps = jnp.maximum(step - jnp.arange(history - 1, -1, -1), 0)
-    log = bank.log[scene, steps[:, None], chosen[None]]
-    there = (bank.log_valid[scene, steps[:, None], chosen[None]] & valid[None])[
-        ..., None
-    ]
-    x, y = frame.place(log[..., 0], log[..., 1])
-    v_x, v_y = frame.turn(log[..., 4], log[..., 5])
-    cos, sin = frame.turn(jnp.cos(log[..., 3]), jnp.sin(log[..., 3]))
+    state = world.state[:, chosen]
+    there = (world.valid[:, chosen] & valid[None])[..., None]
+    x, y = frame.place(state[..., 0], state[..., 1])
+    v_x, v_y = frame.turn(state[..., 3], state[..., 4])
+    cos, sin = frame.turn(jnp.cos(state[..., 2]), jnp.sin(state[..., 2]))
     motion = jnp.stack(
         [
             x / POSITION_SCALE,
@@ -155,11 +146,11 @@ def agent_features(
         -1,
     )
     motion = jnp.where(there, motion, 0.0).transpose(1, 0, 2)
-    kind = bank.object_type[scene, chosen]
+    size, kind = world.size[chosen], kind[chosen]
     fixed = jnp.stack(
         [
-            log[-1, :, 6] / SIZE_SCALE,
-            log[-1, :, 7] / SIZE_SCALE,
+            size[:, 0] / SIZE_SCALE,
+            size[:, 1] / SIZE_SCALE,
             *((kind == k).astype(jnp.float32) for k in (1, 2, 3)),
         ],
         -1,
@@ -194,7 +185,7 @@ def light_features(
     step: Int[Array, ""],
     frame: Frame,
     count: int,
-    radius: float,
+    radius: Float[Array, ""],
 ) -> tuple[Float[Array, "lights light"], Bool[Array, " lights"]]:
     """The nearest traffic lights within `radius`, and which slots they fill."""
     position = bank.light_position[scene]

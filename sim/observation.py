@@ -1,10 +1,11 @@
 """What a controlled object sees: fixed-size features in its own frame.
 
-A pure function of the scene, the step and the last H states of the controlled object,
-so that a transition's row of states renders, anywhere, the very observation that its
-actor acted on. The frame is the object's: x ahead, y to its left, origin at its centre.
-Positions are divided by `POSITION_SCALE`, speeds by `SPEED_SCALE`; one-hot types and
-cosines stand as they are. Values under a False mask are 0.
+A pure function of the scene, the step and the last H states of the controlled objects
+(`sim.world.View`), so that a transition's row of states renders, anywhere, the very
+observation that its actor acted on. The frame is the object's: x ahead, y to its left,
+origin at its centre. Positions are divided by `POSITION_SCALE`, speeds by
+`SPEED_SCALE`; one-hot types and cosines stand as they are. Values under a False mask
+are 0.
 
 - ego: speed, size, own past H-1 poses, curvature-free motion (yaw rate, acceleration
   from the last two states), distance and bearing along the logged route: the offset
@@ -41,6 +42,7 @@ from sim.features import (
     route_features,
 )
 from sim.scene import RoadKind
+from sim.world import View, World, exists, row_of, world_of
 
 
 @dataclass(frozen=True)
@@ -125,48 +127,59 @@ def _road_class(kind: Int[Array, "..."]) -> Int[Array, "..."]:
     return result
 
 
-def observe(
+def observe(bank: Bank, view: View, config: ObservationConfig) -> Observation:
+    """What each controlled object of one scene sees; axis `controlled` in front.
+
+    They see one another where they are simulated and all others where the log has
+    them. An empty slot sees nothing: all is 0 and masked.
+    """
+    world = world_of(bank, view)
+    one = functools.partial(_observe_one, bank, view.scene, view.step, world, config)
+    return jax.vmap(one)(view.controlled, view.history, view.history_valid)
+
+
+def _observe_one(
     bank: Bank,
     scene: Int[Array, ""],
     step: Int[Array, ""],
+    world: World,
+    config: ObservationConfig,
     controlled: Int[Array, ""],
     history: Float[Array, "history 5"],
     history_valid: Bool[Array, " history"],
-    config: ObservationConfig,
 ) -> Observation:
-    """The observation of object `controlled` at `step`; all others replay the log.
-
-    `history` holds its simulated states (x, y, yaw, v_x, v_y), oldest first, the last
-    of them at `step`.
-    """
+    there, own = exists(bank, controlled), row_of(bank, controlled)
     now = history[-1]
     frame = Frame(now[0], now[1], jnp.cos(now[2]), jnp.sin(now[2]))
     agents, agents_valid = agent_features(
+        world,
+        bank.object_type[scene],
+        own,
+        frame,
+        neighbours=config.neighbours,
+        radius=jnp.where(there, config.radius, 0.0),
+    )
+    road, road_valid = _road(bank, scene, there, frame, config)
+    lights, lights_valid = light_features(
         bank,
         scene,
         step,
-        controlled,
         frame,
-        history=config.history,
-        neighbours=config.neighbours,
-        radius=config.radius,
+        count=config.lights,
+        radius=jnp.where(there, config.radius, 0.0),
     )
-    road, road_valid = _road(bank, scene, frame, config)
-    lights, lights_valid = light_features(
-        bank, scene, step, frame, count=config.lights, radius=config.radius
-    )
-    own = own_features(bank, scene, step, controlled, history, history_valid, frame)
     route = route_features(
         bank,
         scene,
-        controlled,
+        own,
         now,
         frame,
         points=config.route_points,
         gap=config.route_gap,
     )
+    ego = own_features(history, history_valid, world.size[own], frame)
     return Observation(
-        ego=jnp.concatenate([own, route]),
+        ego=jnp.where(there, jnp.concatenate([ego, route]), 0.0),
         agents=agents,
         agents_valid=agents_valid,
         road=road,
@@ -188,7 +201,11 @@ def cell_of(
 
 
 def _road(
-    bank: Bank, scene: Int[Array, ""], frame: Frame, config: ObservationConfig
+    bank: Bank,
+    scene: Int[Array, ""],
+    there: Bool[Array, ""],
+    frame: Frame,
+    config: ObservationConfig,
 ) -> tuple[Float[Array, "rows road"], Bool[Array, " rows"]]:
     cell = cell_of(bank, scene, frame.x, frame.y)
     rows = config.road_rows
@@ -196,7 +213,7 @@ def _road(
     near = bank.rows[jnp.maximum(row, 0), :rows].astype(jnp.int32)
     near = near + bank.segment_start[scene]
     valid = jnp.arange(rows) < bank.row_count[jnp.maximum(row, 0)].astype(jnp.int32)
-    valid = valid & (row >= 0)
+    valid = valid & (row >= 0) & there
     segment = bank.segments[near]
     x0, y0 = frame.place(segment[:, 0], segment[:, 1])
     x1, y1 = frame.place(segment[:, 2], segment[:, 3])
@@ -219,42 +236,26 @@ def _road(
     return jnp.where(valid[:, None], features, 0.0), valid
 
 
-def observe_batch(
-    bank: Bank,
-    scene: Int[Array, " batch"],
-    step: Int[Array, " batch"],
-    controlled: Int[Array, " batch"],
-    history: Float[Array, "batch history 5"],
-    history_valid: Bool[Array, "batch history"],
-    config: ObservationConfig,
-) -> Observation:
-    """`observe` for a batch, compiled apart from the program around it.
+def observe_batch(bank: Bank, view: View, config: ObservationConfig) -> Observation:
+    """`observe` for a batch of scenes, compiled apart from the program around it.
+
+    `view` has the axis `batch` in front, the result `batch controlled`.
 
     Fused with its callers its last bits would depend on them, and a row rendered by
     the learner would differ from what its actor saw. XLA drops optimisation barriers
     before it fuses on a CPU, but never fuses across a call that it may not inline
-    (CPU only: not tried elsewhere). A batch of one is computed as two: axes of length
-    one compile to other arithmetic.
+    (CPU only: not tried elsewhere). A batch of one object is computed as two: axes of
+    length one compile to other arithmetic.
     """
-    rows = (scene, step, controlled, history, history_valid)
-    alone = scene.shape[0] == 1
+    alone = view.controlled.shape == (1, 1)
     if alone:
-        rows = jax.tree.map(lambda value: jnp.concatenate([value, value]), rows)
+        view = jax.tree.map(lambda value: jnp.concatenate([value, value]), view)
     apart = {"inlineable": "false"} if jax.default_backend() == "cpu" else {}
     with set_xla_metadata(**apart):  # type: ignore[no-untyped-call]
-        batched = _observe_rows(bank, *rows, config=config)
+        batched = _observe_views(bank, view, config=config)
     return jax.tree.map(lambda value: value[:1], batched) if alone else batched
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _observe_rows(
-    bank: Bank,
-    scene: Int[Array, " batch"],
-    step: Int[Array, " batch"],
-    controlled: Int[Array, " batch"],
-    history: Float[Array, "batch history 5"],
-    history_valid: Bool[Array, "batch history"],
-    config: ObservationConfig,
-) -> Observation:
-    batched = jax.vmap(observe, in_axes=(None, 0, 0, 0, 0, 0, None))
-    return batched(bank, scene, step, controlled, history, history_valid, config)
+def _observe_views(bank: Bank, view: View, config: ObservationConfig) -> Observation:
+    return jax.vmap(observe, in_axes=(None, 0, None))(bank, view, config)

@@ -195,19 +195,33 @@ def overlap(scene: Scene) -> Bool[np.ndarray, "objects steps"]:
     return result
 
 
+def bicycle_actions(
+    velocity_tm1: Float[np.ndarray, "*states 2"],
+    velocity_t: Float[np.ndarray, "*states 2"],
+    yaw_tm1: Float[np.ndarray, "*states"],
+    dt: float,
+) -> tuple[Float[np.ndarray, "*states"], Float[np.ndarray, "*states"]]:
+    """Acceleration and curvature between two states by the inverse bicycle model."""
+    before = np.linalg.norm(velocity_tm1, axis=-1)
+    now = np.linalg.norm(velocity_t, axis=-1)
+    acceleration = (now - before) / dt
+    heading = np.arctan2(velocity_t[..., 1], velocity_t[..., 0])
+    turned = (heading - yaw_tm1 + np.pi) % (2 * np.pi) - np.pi
+    travelled = before * dt + 0.5 * acceleration * dt**2
+    moving = (before >= MIN_SPEED) & (now >= MIN_SPEED)
+    curvature = np.where(moving, turned / np.where(moving, travelled, 1.0), 0.0)
+    return acceleration, curvature
+
+
 def kinematic(scene: Scene) -> Bool[np.ndarray, "objects steps"]:
     """Whether the step that ends at t needs too much acceleration or curvature.
 
     By the inverse bicycle model, where both states are valid; False at step 0.
     """
-    speed = np.linalg.norm(scene.velocity, axis=-1)
-    before, now = speed[:, :-1], speed[:, 1:]
-    acceleration = (now - before) / scene.dt
-    heading = np.arctan2(scene.velocity[:, 1:, 1], scene.velocity[:, 1:, 0])
-    turned = (heading - scene.yaw[:, :-1] + np.pi) % (2 * np.pi) - np.pi
-    travelled = before * scene.dt + 0.5 * acceleration * scene.dt**2
-    moving = (before >= MIN_SPEED) & (now >= MIN_SPEED)
-    curvature = np.where(moving, turned / np.where(moving, travelled, 1.0), 0.0)
+    velocity = scene.velocity
+    acceleration, curvature = bicycle_actions(
+        velocity[:, :-1], velocity[:, 1:], scene.yaw[:, :-1], scene.dt
+    )
     too_much = (np.abs(acceleration) > MAX_ACCELERATION) | (
         np.abs(curvature) > MAX_CURVATURE
     )

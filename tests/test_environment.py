@@ -24,8 +24,6 @@ _reset = jax.jit(environment.reset, static_argnums=3)
 _start_at = jax.jit(environment.start_at, static_argnums=4)
 _step = jax.jit(environment.step, static_argnums=3)
 _advance = jax.jit(environment.advance, static_argnums=3)
-_auto_reset = jax.jit(environment.auto_reset, static_argnums=4)
-_random_start = jax.jit(environment.random_start, static_argnums=2)
 
 # Scenes of the bank: alone on a straight road; towards a parked car; leaving the
 # road at an angle; half as long; with an object that appears and one that leaves.
@@ -241,35 +239,6 @@ def test_controlled_objects_meet_where_they_are_not_where_they_were(file) -> Non
     assert outcome.overlap.all()
 
 
-def test_auto_reset_restarts_what_is_over_and_nothing_else(file) -> None:
-    key = jax.random.key(0)
-    state = start(file, PARKED, config=ENDING)
-    for running, outcome in run(file, state, ENDING):
-        kept = _auto_reset(key, file.bank, running, outcome, ENDING)
-        over = bool(outcome.truncated) or bool(outcome.terminated.all())
-        if not over:
-            assert all(
-                bool((one == other).all())
-                for one, other in zip(kept, running, strict=True)
-            )
-            continue
-        scene = int(kept.scene)
-        assert int(kept.step) == int(file.arrays["current_step"][scene])
-        assert int(kept.controlled[0]) == int(file.arrays["sdc"][scene])
-        fresh = start(file, scene, config=ENDING)
-        np.testing.assert_array_equal(kept.history, fresh.history)
-        np.testing.assert_array_equal(kept.along, fresh.along)
-
-
-def test_restarts_draw_every_scene(file) -> None:
-    keys = jax.random.split(jax.random.key(1), 100)
-    draw = jax.jit(
-        jax.vmap(environment.random_start, in_axes=(0, None, None)), static_argnums=2
-    )
-    state = draw(keys, file.bank, CONFIG)
-    assert set(np.asarray(state.scene).tolist()) == set(range(file.scenes))
-
-
 def test_a_batch_is_its_scenes(tmp_path: Path) -> None:
     """`jax.vmap` outside gives what one scene alone gives."""
     file = scenes.bank_of(list(generate_many(4, 3)), tmp_path)
@@ -311,7 +280,7 @@ def test_random_driving_stays_finite(tmp_path: Path) -> None:
         def one(scene, actions, bank, config=config):
             def step(state, action):
                 state, outcome = environment.step(bank, state, action[None], config)
-                seen = environment.observe_state(bank, state, 0, config)
+                seen = environment.observe_state(bank, state, config)
                 return state, (seen, outcome.reward)
 
             state = environment.reset(bank, scene, bank.sdc[scene][None], config)
@@ -327,22 +296,10 @@ def test_random_driving_stays_finite(tmp_path: Path) -> None:
             assert np.isfinite(value).all(), name
 
 
-def test_observing_a_state_is_observing_its_object(file) -> None:
-    state = start(file, ALONE, 0, 1)
-    look = jax.jit(environment.observe_state, static_argnums=(2, 3))
-    second = look(file.bank, state, 1, CONFIG)
-    alone = look(file.bank, start(file, ALONE, 1), 0, CONFIG)
-    for one, other in zip(second, alone, strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-6)
-
-
 def test_every_entry_point_compiles_once(file) -> None:
     bank = file.bank
     functions = {
         "reset": lambda scene: environment.reset(bank, scene, scene[None] * 0, CONFIG),
-        "random_start": lambda scene: environment.random_start(
-            jax.random.fold_in(jax.random.key(0), scene), bank, CONFIG
-        ),
     }
     for name, function in functions.items():
         jitted, traces = scenes.counted(function)

@@ -201,16 +201,7 @@ def test_greedy_takes_the_highest_q_value_of_every_object(tmp_path: Path) -> Non
     decision = jax.jit(agent)(jax.random.key(0), bank, state)
 
     def q_values(state: State) -> jax.Array:
-        look = jax.vmap(observe, in_axes=(None, None, None, 0, 0, 0, None))
-        observation = look(
-            bank,
-            state.scene,
-            state.step,
-            state.controlled,
-            state.history,
-            state.history_valid,
-            CONFIG.observation,
-        )
+        observation = observe(bank, state.view, CONFIG.observation)
         return batched(
             weights, observation, config=NETWORK, sizes=SIZES, actions=ACTIONS
         )
