@@ -3,9 +3,11 @@
     WOMD Scenario     TFRecord of `Scenario` messages      sim.womd
     WOMD tf.Example   TFRecord of flat examples            sim.womd_example
     GPUDrive          JSON with `objects` and `roads`      sim.gpudrive
+    Argoverse 2       Parquet, and its map (JSON) beside   sim.argoverse2
 
 A file that is named must be one of them. Of a folder, files that are not are left out
-and can be had from `on_skip`; files are read in sorted order, each once. Every error
+and can be had from `on_skip` (but for the maps of Argoverse 2, which are read with
+their scenarios); files are read in sorted order, each once. Every error
 is one line that names file, record, place and what to do.
 """
 
@@ -13,13 +15,15 @@ import enum
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
-from sim import tfrecord
+from sim import argoverse2, tfrecord
 from sim.gpudrive import parse_gpudrive
 from sim.scene import Scene, SceneError
 from sim.womd import parse_scenario
 from sim.womd_example import is_example, parse_example
 
-SUPPORTED = "WOMD Scenario and tf.Example TFRecords and GPUDrive JSON"
+SUPPORTED = (
+    "WOMD Scenario and tf.Example TFRecords, GPUDrive JSON and Argoverse 2 Parquet"
+)
 
 _HEAD_BYTES = 4096
 _BANK_MAGIC = b"SLIPBANK"  # `sim.bank` has it too; importing that imports jax
@@ -37,6 +41,8 @@ class Format(enum.Enum):
     WOMD_SCENARIO = "WOMD Scenario TFRecord"
     WOMD_EXAMPLE = "WOMD tf.Example TFRecord"
     GPUDRIVE = "GPUDrive JSON"
+    ARGOVERSE2 = "Argoverse 2 Parquet"
+    ARGOVERSE2_MAP = "map of an Argoverse 2 scenario"
     BANK = "Slipstream bank"
 
 
@@ -55,12 +61,25 @@ def detect(path: Path) -> Format:
     if tfrecord.is_header(head):
         return _detect_record(path)
     if head.removeprefix(_MARK).lstrip().startswith(b"{"):
-        if b'"objects"' in _read_bytes(path):
-            return Format.GPUDRIVE
+        return _detect_json(path)
+    if head.startswith(argoverse2.MAGIC):
+        if argoverse2.is_scenario(path):
+            return Format.ARGOVERSE2
         raise UnsupportedFormat(
-            f"{path}: JSON without objects; supported are {SUPPORTED}"
+            f"{path}: Parquet without an Argoverse 2 scenario's columns; supported are "
+            f"{SUPPORTED}"
         )
     raise _refusal(path, head)
+
+
+def _detect_json(path: Path) -> Format:
+    """What a JSON file holds."""
+    text = _read_bytes(path)
+    if argoverse2.is_map(text):
+        return Format.ARGOVERSE2_MAP
+    if b'"objects"' in text:
+        return Format.GPUDRIVE
+    raise UnsupportedFormat(f"{path}: JSON without objects; supported are {SUPPORTED}")
 
 
 def _detect_record(path: Path) -> Format:
@@ -131,7 +150,10 @@ def _scene_files(folder: Path, on_skip: Callable[[str], None] | None) -> Iterabl
 def _is_scene_file(file: Path, on_skip: Callable[[str], None] | None) -> bool:
     """Whether to read a file that lies in a folder; tells `on_skip` if not."""
     try:
-        if detect(file) is not Format.BANK:
+        kind = detect(file)
+        if kind is Format.ARGOVERSE2_MAP:
+            return False
+        if kind is not Format.BANK:
             return True
         reason = f"{file}: is a bank"
     except UnsupportedFormat as error:
@@ -179,6 +201,14 @@ def _read_as(path: Path, format_: Format) -> Iterator[Scene | SceneError]:
     """Yields the outcomes of the records of a file of this format."""
     if format_ is Format.BANK:
         raise SceneError(f"{path}: is a bank, converted already; use it as it is")
+    if format_ is Format.ARGOVERSE2_MAP:
+        raise SceneError(
+            f"{path}: is a map of Argoverse 2; give the scenario's Parquet file, which "
+            "is read with the map beside it"
+        )
+    if format_ is Format.ARGOVERSE2:
+        yield argoverse2.read_argoverse2(path)
+        return
     if format_ is Format.GPUDRIVE:
         yield parse_gpudrive(_read_bytes(path).removeprefix(_MARK), source=str(path))
         return
