@@ -218,7 +218,16 @@ def apply_discrete(
     state: ObjectState, index: Int[Array, ""], config: ActionConfig, dt: float
 ) -> ObjectState:
     """One step of the action space's dynamics with the grid's action `index`."""
-    action = jnp.asarray(action_table(config))[index]
+    return apply_continuous(state, jnp.asarray(action_table(config))[index], config, dt)
+
+
+def apply_continuous(
+    state: ObjectState,
+    action: Float[Array, " components"],
+    config: ActionConfig,
+    dt: float,
+) -> ObjectState:
+    """One step with any action of the grid's space; Delta's in the object's frame."""
     if config.space == ActionSpace.BICYCLE:
         return bicycle(state, limit_reverse(state, action, dt), dt)
     return delta(state, _turned(action, state.yaw), dt)
