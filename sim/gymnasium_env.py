@@ -24,7 +24,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
 
 from sim import metrics
 from sim.bank import Bank, BankError, BankFile
@@ -34,13 +34,11 @@ from sim.environment import (
     State,
     advance,
     logged_states,
-    random_start,
-    reset,
 )
-from sim.observation import Observation, observe_batch
+from sim.episodes import sdc_only, starts
+from sim.observation import Observation, observation_sizes, observe_batch
 
 Observed = dict[str, np.ndarray]
-Keys = Key[Array, " environments"]
 
 
 class StepInfo(NamedTuple):
@@ -67,25 +65,18 @@ class _Stepped(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="config")
 def _start(
-    keys: Keys,
     bank: Bank,
+    begin: State,
     scene: Int[Array, " environments"],
     before: State | None,
     mask: Bool[Array, " environments"],
     config: EnvironmentConfig,
 ) -> tuple[State, Observation, StepInfo]:
-    """The masked environments at the start of their scenes, the others as before.
+    """The masked environments at the start of these scenes, the others as before.
 
-    A scene of -1 is drawn. Without a `before` all of them start.
+    Without a `before` all of them start.
     """
-
-    def one(key: PRNGKeyArray, index: Int[Array, ""]) -> State:
-        chosen = jnp.maximum(index, 0)
-        given = reset(bank, chosen, bank.sdc[chosen][None], config)
-        drawn = random_start(key, bank, config)
-        return jax.tree.map(lambda a, b: jnp.where(index >= 0, a, b), given, drawn)
-
-    state = jax.vmap(one)(keys, scene)
+    state = jax.tree.map(lambda values: values[scene], begin)
     if before is not None:
         state = _chosen(mask, state, before)
     nothing = jnp.zeros(scene.shape, bool)
@@ -94,14 +85,15 @@ def _start(
 
 @functools.partial(jax.jit, static_argnames="config")
 def _step(
-    keys: Keys,
     bank: Bank,
+    begin: State,
+    scene: Int[Array, " environments"],
     state: State,
     over: Bool[Array, " environments"],
     action: Array,
     config: EnvironmentConfig,
 ) -> _Stepped:
-    """Steps those that go on; those whose episode was over start anew instead."""
+    """Steps those that go on; those that are over start in their `scene` instead."""
 
     def move(
         now: Float[Array, "5"], chosen: Int[Array, ""] | Float[Array, " components"]
@@ -114,8 +106,7 @@ def _step(
     stepped, outcome = jax.vmap(advance, in_axes=(None, 0, 0, None))(
         bank, state, moved[:, None], config
     )
-    fresh = jax.vmap(random_start, in_axes=(0, None, None))(keys, bank, config)
-
+    fresh = jax.tree.map(lambda values: values[scene], begin)
     following = _chosen(over, fresh, stepped)
     overlap, offroad = outcome.overlap[:, 0] & ~over, outcome.offroad[:, 0] & ~over
     return _Stepped(
@@ -138,15 +129,9 @@ def _chosen(mask: Bool[Array, " environments"], new: State, old: State) -> State
 
 
 def _seen(bank: Bank, state: State, config: EnvironmentConfig) -> Observation:
-    return observe_batch(
-        bank,
-        state.scene,
-        state.step,
-        state.controlled[:, 0],
-        state.history[:, 0],
-        state.history_valid[:, 0],
-        config.observation,
-    )
+    """What the one controlled object of each environment sees."""
+    seen = observe_batch(bank, state.view, config.observation)
+    return jax.tree.map(lambda values: values[:, 0], seen)
 
 
 def _info(
@@ -174,18 +159,19 @@ def _action_space(config: EnvironmentConfig, continuous: bool) -> spaces.Space[A
     return spaces.Box(table.min(0), table.max(0), dtype=np.float32)
 
 
-def _observation_space(file: BankFile, config: EnvironmentConfig) -> spaces.Space[Any]:
-    keys, first = jax.random.split(jax.random.key(0), 1), jnp.zeros(1, jnp.int32)
-    shapes = jax.eval_shape(
-        lambda: _start(keys, file.bank, first, None, first == 0, config)
-    )[1]
-    parts: dict[str, spaces.Space[Any]] = {}
-    for name, value in shapes._asdict().items():
-        shape = value.shape[1:]
-        if value.dtype == jnp.bool_:
-            parts[name] = spaces.MultiBinary(shape[0])
-        else:
-            parts[name] = spaces.Box(-np.inf, np.inf, shape, np.float32)
+def _observation_space(config: EnvironmentConfig) -> spaces.Space[Any]:
+    sizes = observation_sizes(config.observation)
+    rows = {
+        "agents": (sizes.neighbours, sizes.agent),
+        "road": (sizes.rows, sizes.road),
+        "lights": (sizes.lights, sizes.light),
+    }
+    parts: dict[str, spaces.Space[Any]] = {
+        "ego": spaces.Box(-np.inf, np.inf, (sizes.ego,), np.float32)
+    }
+    for name, shape in rows.items():
+        parts[name] = spaces.Box(-np.inf, np.inf, shape, np.float32)
+        parts[f"{name}_valid"] = spaces.MultiBinary(shape[0])
     return spaces.Dict(parts)
 
 
@@ -216,16 +202,17 @@ class _Simulator:
                 f"{config.dt} s; set EnvironmentConfig.dt to the bank's"
             )
         self.action_space = _action_space(config, continuous)
-        self.observation_space = _observation_space(file, config)
+        self.observation_space = _observation_space(config)
         self._file, self._bank, self._config = file, file.bank, config
         self._environments, self._restarts = environments, restarts
-        self._key = jax.random.key(0)
+        self._begin = starts(self._bank, sdc_only, config)
+        self._random = np.random.default_rng()
         self._state: State | None = None
         self._over = np.zeros(environments, bool)
 
     def seed(self, seed: int) -> None:
         """Scenes are drawn from here on as this seed has it."""
-        self._key = jax.random.key(seed)
+        self._random = np.random.default_rng(seed)
 
     def start(self, options: dict[str, Any]) -> tuple[Observed, dict[str, np.ndarray]]:
         """Environments anew: all, or those of the option `reset_mask`.
@@ -239,11 +226,11 @@ class _Simulator:
                 f"scene {scene}: the bank {self._file.path} has scenes 0 to "
                 f"{self._file.scenes - 1}"
             )
-        scenes = np.full(self._environments, scene, np.int32)
+        scenes = self._drawn() if scene < 0 else np.full(len(mask), scene, np.int32)
         self._over = self._over & ~mask
         before = None if mask.all() else self._state
         self._state, observation, info = _start(
-            self._keys(), self._bank, scenes, before, mask, self._config
+            self._bank, self._begin, scenes, before, mask, self._config
         )
         return _as_numpy(observation), self._named(info)
 
@@ -263,7 +250,13 @@ class _Simulator:
         else:
             action = np.asarray(action, np.int32)
         result = _step(
-            self._keys(), self._bank, self._state, self._over, action, self._config
+            self._bank,
+            self._begin,
+            self._drawn(),
+            self._state,
+            self._over,
+            action,
+            self._config,
         )
         self._state = result.state
         reward, terminated, truncated = (
@@ -276,9 +269,10 @@ class _Simulator:
         observation = _as_numpy(result.observation)
         return observation, reward, terminated, truncated, self._named(result.info)
 
-    def _keys(self) -> Keys:
-        self._key, key = jax.random.split(self._key)
-        return jax.random.split(key, self._environments)
+    def _drawn(self) -> Int[np.ndarray, " environments"]:
+        """Scenes to start in."""
+        drawn = self._random.integers(self._file.scenes, size=self._environments)
+        return drawn.astype(np.int32)
 
     def _named(self, info: StepInfo) -> dict[str, np.ndarray]:
         return {name: np.array(value) for name, value in info._asdict().items()}
