@@ -29,7 +29,7 @@ from sim import convert
 from sim.scene import Scene
 
 MAGIC = b"SLIPBANK"
-VERSION = 2
+VERSION = 3
 ALIGNMENT = 4096
 
 
@@ -51,6 +51,16 @@ class Bank(NamedTuple):
     route_spacing: Float[Array, "scenes objects"]  # m between two route points
     route_start: Float[Array, "scenes objects"]  # m, arc length at `current_step`
     route_end: Float[Array, "scenes objects"]  # m, arc length at the log's end
+    route_speed: Float[Array, "scenes objects"]  # m/s, limit where it starts, 0 unknown
+    path_chunk: UInt[Array, "scenes objects chunks"]  # row of `chunks`, of the scene's
+    path_flags: UInt[Array, "scenes objects chunks"]  # `lane_paths.ON`, `OFF`; 0 fills
+    path_offset: Float[Array, "scenes objects chunks"]  # m, arc length where it starts
+    path_start: Float[Array, "scenes objects"]  # m, arc length at `current_step`
+    path_end: Float[Array, "scenes objects"]  # m, arc length at the log's end
+    chunk_start: Int[Array, " scenes"]  # first row of `chunks`
+    chunks: Float[Array, "rows 9 2"]  # m, stretches of lanes; the last point fills up
+    stop_position: Float[Array, "scenes stops 2"]  # m, where lanes pass stop signs
+    stops: Int[Array, " scenes"]  # stop positions of the scene
     light_position: Float[Array, "scenes lights 2"]  # m, the stop point
     light_state: Int[Array, "scenes steps lights"]  # `LightState`
     lights: Int[Array, " scenes"]  # lights of the scene

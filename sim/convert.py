@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sim import edge_table, tables
+from sim import edge_table, routes, tables
 from sim.scene import Scene, SceneError
 
 Converted = dict[str, Any]  # one scene's part of every array of the bank
 
 LOG_FIELDS = ("x", "y", "z", "yaw", "v_x", "v_y", "length", "width")
-ROUTE_POINTS = 64
-ROUTE_AHEAD = 40.0  # m that a route goes on straight behind the log's end
-ROUTE_STEP = 0.5  # m: shorter moves are jitter of a standing object
 ROWS = 64  # road segments kept per cell
 FEW = 12  # scenes
 MAX_CANDIDATES = 64  # edges per fine cell; measured: 12 to 30 at the 99th percentile
@@ -38,7 +35,6 @@ def convert(scene: Scene) -> Converted:
     log, valid = _log(scene, origin)
     grid = tables.grid_of(scene)
     ground = np.concatenate([line.points for line in scene.roads] or [np.zeros((1, 3))])
-    route, spacing, start, end = _routes(log, valid, scene.current_step)
     segments, kinds = tables.row_segments(scene.roads)
     _check_small(scene, "road segments", len(segments), 2**16)
     row_of, rows, counts = tables.row_table(grid, segments, ROWS)
@@ -54,10 +50,7 @@ def convert(scene: Scene) -> Converted:
         "log": log,
         "log_valid": valid,
         "object_type": scene.object_types.astype(np.int8),
-        "route": route,
-        "route_spacing": spacing,
-        "route_start": start,
-        "route_end": end,
+        **routes.routes_of(scene, origin),
         "light_position": (scene.lights.stop_points - origin)[:, :2].astype(np.float32),
         "light_state": scene.lights.states.T.astype(np.int8),
         "grid_origin": (grid.origin - origin[:2]).astype(np.float32),
@@ -140,54 +133,6 @@ def _log(
     )
 
 
-def _routes(
-    log: Float[np.ndarray, "steps objects 8"],
-    valid: Bool[np.ndarray, "steps objects"],
-    current_step: int,
-) -> tuple[
-    Float[np.ndarray, "objects points 2"],
-    Float[np.ndarray, " objects"],
-    Float[np.ndarray, " objects"],
-    Float[np.ndarray, " objects"],
-]:
-    """Each object's logged path with equally spaced points, and where on it it is."""
-    objects = log.shape[1]
-    route = np.zeros((objects, ROUTE_POINTS, 2), np.float32)
-    spacing = np.ones(objects, np.float32)
-    start, end = np.zeros(objects, np.float32), np.zeros(objects, np.float32)
-    for index in range(objects):
-        seen = np.flatnonzero(valid[:, index])
-        if not len(seen):
-            continue
-        path = log[seen, index, :2].astype(np.float64)
-        knots, reached = _knots(path)
-        yaw = float(log[seen[-1], index, 3])
-        heading = np.array([np.cos(yaw), np.sin(yaw)])
-        if len(knots) > 1:
-            heading = knots[-1] - knots[-2]
-            heading /= np.hypot(*heading)
-        knots = np.concatenate([knots, knots[-1:] + ROUTE_AHEAD * heading])
-        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(knots, axis=0).T))])
-        at = np.linspace(0.0, arc[-1], ROUTE_POINTS)
-        route[index] = np.stack([np.interp(at, arc, knots[:, k]) for k in (0, 1)], -1)
-        spacing[index] = at[1]
-        first = min(int(np.searchsorted(seen, current_step)), len(seen) - 1)
-        start[index], end[index] = arc[reached[first]], arc[reached[-1]]
-    return route, spacing, start, end
-
-
-def _knots(
-    path: Float[np.ndarray, "points 2"],
-) -> tuple[Float[np.ndarray, "knots 2"], Int[np.ndarray, " points"]]:
-    """The path less its jitter, and the last knot that each point had reached."""
-    kept, reached = [0], []
-    for index in range(len(path)):
-        if np.hypot(*(path[index] - path[kept[-1]])) > ROUTE_STEP:
-            kept.append(index)
-        reached.append(len(kept) - 1)
-    return path[kept], np.array(reached)
-
-
 def _candidate_rows(
     state: Int[np.ndarray, " fine"], candidates: list[Int[np.ndarray, " _"]]
 ) -> tuple[Int[np.ndarray, " fine"], Int[np.ndarray, "mixed width"]]:
@@ -230,14 +175,16 @@ def stack(scenes: list[Converted]) -> dict[str, np.ndarray]:
     objects = max(scene["log"].shape[1] for scene in scenes)
     lights = max(1, max(len(scene["light_position"]) for scene in scenes))
     width = max(scene["fine_edges"].shape[1] for scene in scenes)
+    chunks = max(1, max(scene["path_chunk"].shape[1] for scene in scenes))
+    stops = max(1, max(len(scene["stop_position"]) for scene in scenes))
     shapes = {
         "log": (steps, objects, len(LOG_FIELDS)),
         "log_valid": (steps, objects),
         "object_type": (objects,),
-        "route": (objects, ROUTE_POINTS, 2),
-        "route_spacing": (objects,),
-        "route_start": (objects,),
-        "route_end": (objects,),
+        "route": (objects, routes.ROUTE_POINTS, 2),
+        **dict.fromkeys(routes.PER_OBJECT, (objects,)),
+        **dict.fromkeys(routes.PER_CHUNK, (objects, chunks)),
+        "stop_position": (stops, 2),
         "light_position": (lights, 2),
         "light_state": (steps, lights),
     }
@@ -251,9 +198,12 @@ def stack(scenes: list[Converted]) -> dict[str, np.ndarray]:
     for name in ("grid_origin", "grid_shape"):
         arrays[name] = np.stack([scene[name] for scene in scenes])
     arrays["lights"] = np.array([len(s["light_position"]) for s in scenes], np.int32)
+    arrays["stops"] = np.array([len(s["stop_position"]) for s in scenes], np.int32)
+    arrays["chunk_start"] = _starts(scenes, "chunks")
     arrays["segment_start"] = _starts(scenes, "segments")
     arrays["cell_start"] = _starts(scenes, "cell_row")
-    for name in ("segments", "segment_kind", "rows", "row_count", "edges"):
+    tables_ = ("segments", "segment_kind", "rows", "row_count", "edges", "chunks")
+    for name in tables_:
         arrays[name] = np.concatenate([scene[name] for scene in scenes])
     for name, table in (
         ("cell_row", "rows"),
@@ -273,7 +223,6 @@ def stack(scenes: list[Converted]) -> dict[str, np.ndarray]:
         ]
     ).astype(np.int32)
     # A gather needs a row to read even where no scene has a map of that kind.
-    tables_ = ("segments", "segment_kind", "rows", "row_count", "edges")
     for name in (*tables_, "fine_state", "fine_edges"):
         if not len(arrays[name]):
             empty = arrays[name]

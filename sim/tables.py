@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt
+from jaxtyping import Bool, Float, Int, UInt
 
 from sim.scene import Polyline, RoadKind, Scene
 
@@ -79,7 +79,7 @@ def row_segments(
         if len(points) == 1:
             segments = np.concatenate([points, points], 1)
         else:
-            points = _split(_decimate(points))
+            points = _split(points[keep_points(points, ROW_TOLERANCE)])
             segments = np.concatenate([points[:-1], points[1:]], 1)
         ends.append(segments)
         kinds.append(np.full(len(segments), int(line.kind), np.int8))
@@ -88,8 +88,10 @@ def row_segments(
     return np.concatenate(ends), np.concatenate(kinds)
 
 
-def _decimate(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "kept 2"]:
-    """Douglas-Peucker: what is kept lies within `ROW_TOLERANCE` of what was there."""
+def keep_points(
+    points: Float[np.ndarray, "points 2"], tolerance: float
+) -> Bool[np.ndarray, " points"]:
+    """Douglas-Peucker: what is kept lies within `tolerance` [m] of what was there."""
     keep = np.zeros(len(points), bool)
     keep[[0, -1]] = True
     stack = [(0, len(points) - 1)]
@@ -105,10 +107,10 @@ def _decimate(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "kept 
         else:
             away = np.hypot(*offset.T)
         worst = int(away.argmax())
-        if away[worst] > ROW_TOLERANCE:
+        if away[worst] > tolerance:
             keep[first + 1 + worst] = True
             stack += [(first, first + 1 + worst), (first + 1 + worst, last)]
-    return points[keep]
+    return keep
 
 
 def _split(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "more 2"]:

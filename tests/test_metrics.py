@@ -177,7 +177,7 @@ def position(file: BankFile, x: float, y: float, index: int = 0) -> tuple[float,
 @given(st.floats(0, 55), st.floats(-5, 5))
 @settings(max_examples=50, deadline=None)
 def test_route_position_on_a_straight(straight, x, y) -> None:
-    """The route begins at the log's first point and goes on 40 m past its last."""
+    """The route begins at the log's first point and goes on 80 m past its last."""
     along, aside = position(straight, x, y)
     assert along == pytest.approx(x, abs=1e-3)
     assert aside == pytest.approx(abs(y), abs=1e-3)
@@ -185,7 +185,7 @@ def test_route_position_on_a_straight(straight, x, y) -> None:
 
 def test_route_position_past_the_ends(straight) -> None:
     assert position(straight, -3, 4) == pytest.approx((0, 5), abs=1e-3)
-    assert position(straight, 19 + 40 + 3, 4) == pytest.approx((59, 5), abs=1e-3)
+    assert position(straight, 19 + 80 + 3, 4) == pytest.approx((99, 5), abs=1e-3)
 
 
 def test_progress_is_of_the_log_from_the_current_step(straight) -> None:
