@@ -23,6 +23,7 @@ _FIELD = {name: column for column, name in enumerate(LOG_FIELDS)}
 _POLYGONS = (RoadKind.CROSSWALK, RoadKind.SPEED_BUMP)
 _NAMES = {
     ActionSpace.BICYCLE: ("acceleration [m/s²]", "curvature [1/m]"),
+    ActionSpace.STEERING: ("acceleration [m/s²]", "wheel [rad]"),
     ActionSpace.DELTA: ("ahead [m]", "left [m]", "turn [rad]"),
 }
 

@@ -32,7 +32,7 @@ class Decision(NamedTuple):
 Agent = Callable[[PRNGKeyArray, Bank, State], Decision]
 
 
-def _continuous(moved: Float[Array, "controlled 5"]) -> Decision:
+def continuous(moved: Float[Array, "controlled 5"]) -> Decision:
     """A decision without an index."""
     objects = moved.shape[0]
     return Decision(
@@ -40,7 +40,8 @@ def _continuous(moved: Float[Array, "controlled 5"]) -> Decision:
     )
 
 
-def _next_logged(bank: Bank, state: State) -> Float[Array, "controlled 5"]:
+def next_logged(bank: Bank, state: State) -> Float[Array, "controlled 5"]:
+    """The controlled objects' logged states at the next step."""
     step_t = jnp.minimum(state.step + 1, bank.log.shape[1] - 1)
     return logged_states(bank, state.scene, step_t, state.controlled)
 
@@ -49,7 +50,11 @@ def log_playback() -> Agent:
     """Goes where the log went."""
 
     def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
-        return _continuous(_next_logged(bank, state))
+        moved = dynamics.playback(
+            ObjectState(*state.history[:, -1].T),
+            ObjectState(*next_logged(bank, state).T),
+        )
+        return continuous(jnp.stack(moved, -1))
 
     return act
 
@@ -63,7 +68,7 @@ def constant_speed(config: EnvironmentConfig) -> Agent:
 
     def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
         # Once straightened, the velocity lies along the yaw and stays there.
-        return _continuous(jax.vmap(one)(ObjectState(*state.history[:, -1].T)))
+        return continuous(jax.vmap(one)(ObjectState(*state.history[:, -1].T)))
 
     return act
 
@@ -106,25 +111,38 @@ def expert(config: EnvironmentConfig, through: ExpertSpace) -> Agent:
     def one(
         now: ObjectState, following: ObjectState
     ) -> tuple[Float[Array, "5"], Int[Array, ""]]:
-        if through.space == ActionSpace.BICYCLE:
-            action = dynamics.bicycle_inverse(now, following, config.dt)
-        else:
-            action = dynamics.delta_inverse(now, following)
         if through.on_grid:
+            action = dynamics.inverse(now, following, grid, config.dt)
             index = dynamics.nearest_action(now, action, grid)
             moved = dynamics.apply_discrete(now, index, grid, config.dt)
             return jnp.stack(moved), index
-        if through.space == ActionSpace.BICYCLE:
-            moved = dynamics.bicycle_replay(now, following, config.dt)
-        else:
-            moved = dynamics.delta(now, action, config.dt)
+        moved = dynamics.replay(now, following, grid, config.dt)
         return jnp.stack(moved), jnp.int32(-1)
 
     def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
         moved, action = jax.vmap(one)(
             ObjectState(*state.history[:, -1].T),
-            ObjectState(*_next_logged(bank, state).T),
+            ObjectState(*next_logged(bank, state).T),
         )
         return Decision(moved, action, jnp.zeros((action.shape[0], 0), jnp.float32))
+
+    return act
+
+
+def composite(driver: Agent, slots: int, others: Agent) -> Agent:
+    """The first `slots` controlled objects as `driver` decides, the rest as `others`.
+
+    Both are asked for all objects, so that each sees where all of them are.
+    """
+
+    def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
+        own_key, others_key = jax.random.split(key)
+        own, rest = driver(own_key, bank, state), others(others_key, bank, state)
+        mine = jnp.arange(state.controlled.shape[0]) < slots
+        return Decision(
+            moved=jnp.where(mine[:, None], own.moved, rest.moved),
+            action=jnp.where(mine, own.action, rest.action),
+            q_values=own.q_values,
+        )
 
     return act

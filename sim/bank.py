@@ -44,6 +44,7 @@ class Bank(NamedTuple):
     steps: Int[Array, " scenes"]  # recorded steps, <= the log's axis
     objects: Int[Array, " scenes"]  # recorded objects, <= the log's axis
     sdc: Int[Array, " scenes"]  # the recording vehicle's row
+    tracks: Int[Array, "scenes tracks"]  # rows to predict, filled with the log's length
     log: Float[Array, "scenes steps objects 8"]  # LOG_FIELDS
     log_valid: Bool[Array, "scenes steps objects"]
     object_type: Int[Array, "scenes objects"]  # `ObjectType`
@@ -62,6 +63,7 @@ class Bank(NamedTuple):
     stop_position: Float[Array, "scenes stops 2"]  # m, where lanes pass stop signs
     stops: Int[Array, " scenes"]  # stop positions of the scene
     light_position: Float[Array, "scenes lights 2"]  # m, the stop point
+    light_through: Float[Array, "scenes lights 2"]  # m, on its lane behind that point
     light_state: Int[Array, "scenes steps lights"]  # `LightState`
     lights: Int[Array, " scenes"]  # lights of the scene
     grid_origin: Float[Array, "scenes 2"]  # m

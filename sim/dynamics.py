@@ -1,4 +1,4 @@
-"""Dynamics of one object: Delta and Bicycle with their inverses and discrete grids.
+"""Dynamics of one object: playback, Delta, Bicycle, steering wheel; inverses, grids.
 
 The Waymax paper (Gulino et al., 2023), appendix A.1. States are x, y [m], yaw [rad],
 v_x, v_y [m/s] in the map frame; `dt` is the step length [s].
@@ -11,6 +11,9 @@ Bicycle, action (acceleration a [m/s^2], curvature kappa [1/m]):
     x'     = x + v_x dt + 1/2 a cos(theta) dt^2        y' likewise with sin
     theta' = theta + kappa (v dt + 1/2 a dt^2)         v'  = v + a dt
     v_x'   = v' cos(theta')                            v_y' = v' sin(theta')
+Steering, action (acceleration a [m/s^2], steering wheel's angle theta_w [rad]): Bicycle
+with kappa = sin(theta_w / STEER_RATIO) / L, L the axle distance [m].
+State playback, action (x, y, theta, v_x, v_y): the object takes that state.
 
 Departures, where the paper is silent or misprinted:
 - The inverse bicycle uses atan2(v_y', v_x') as the heading of the new velocity; the
@@ -24,7 +27,7 @@ Departures, where the paper is silent or misprinted:
 """
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -32,6 +35,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 SLOW = 0.6  # m/s; the paper leaves the limit open
+
+
+@dataclass(frozen=True)
+class SteeringWheel:
+    """How a steering wheel's angle bends the path; one for all vehicles."""
+
+    axle_distance: float = 2.9
+    """Between the axles [m]; a mid-size car's."""
+    steer_ratio: float = 15.0
+    """The steering wheel's angle over the front wheels'."""
 
 
 class ObjectState(NamedTuple):
@@ -47,6 +60,16 @@ class ObjectState(NamedTuple):
 def wrap(angle: Float[Array, "..."]) -> Float[Array, "..."]:
     """The angle in [-pi, pi)."""
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+
+
+def playback(state: ObjectState, given: ObjectState) -> ObjectState:
+    """Takes the given state, wherever the object was."""
+    return given
+
+
+def playback_inverse(state: ObjectState, following: ObjectState) -> ObjectState:
+    """The playback action that leads from one state to the following: that one."""
+    return following
 
 
 def delta(state: ObjectState, action: Float[Array, "3"], dt: float) -> ObjectState:
@@ -109,6 +132,21 @@ def bicycle_replay(
     Below `SLOW`, where the action holds no curvature, the recorded yaw is used.
     """
     moved = bicycle(state, bicycle_inverse(state, following, dt), dt)
+    return _with_recorded_yaw(state, following, moved)
+
+
+def steering_replay(
+    state: ObjectState, following: ObjectState, wheel: SteeringWheel, dt: float
+) -> ObjectState:
+    """`bicycle_replay` through the steering wheel."""
+    moved = steering(state, steering_inverse(state, following, wheel, dt), wheel, dt)
+    return _with_recorded_yaw(state, following, moved)
+
+
+def _with_recorded_yaw(
+    state: ObjectState, following: ObjectState, moved: ObjectState
+) -> ObjectState:
+    """`moved` with the yaw of `following` where the inverse could not tell one."""
     slow = (jnp.hypot(state.v_x, state.v_y) < SLOW) | (
         jnp.hypot(following.v_x, following.v_y) < SLOW
     )
@@ -139,11 +177,36 @@ def curvature_to_steering(
     return steer_ratio * jnp.arcsin(jnp.clip(curvature * axle_distance, -1.0, 1.0))
 
 
+def steering(
+    state: ObjectState, action: Float[Array, "2"], wheel: SteeringWheel, dt: float
+) -> ObjectState:
+    """Accelerates by a [m/s^2] with the steering wheel at an angle [rad]."""
+    return bicycle(state, _as_bicycle(action, wheel), dt)
+
+
+def steering_inverse(
+    state: ObjectState, following: ObjectState, wheel: SteeringWheel, dt: float
+) -> Float[Array, "2"]:
+    """The Steering action that leads from one state to the following.
+
+    A curvature beyond 1 / axle distance, which no angle gives, is cut there.
+    """
+    action = bicycle_inverse(state, following, dt)
+    angle = curvature_to_steering(action[1], wheel.axle_distance, wheel.steer_ratio)
+    return jnp.stack([action[0], angle])
+
+
+def _as_bicycle(action: Float[Array, "2"], wheel: SteeringWheel) -> Float[Array, "2"]:
+    curvature = steering_to_curvature(action[1], wheel.axle_distance, wheel.steer_ratio)
+    return jnp.stack([action[0], curvature])
+
+
 class ActionSpace(enum.StrEnum):
-    """The discrete action spaces of the paper."""
+    """The discrete action spaces: the paper's, and one over the steering wheel."""
 
     BICYCLE = "bicycle-discrete"
     DELTA = "delta-discrete"
+    STEERING = "steering-discrete"
 
 
 @dataclass(frozen=True)
@@ -164,6 +227,12 @@ class ActionConfig:
     """Bicycle: largest |kappa| [1/m]; the benchmark's feasibility limit."""
     curvature_bins: int = 13
     """Bicycle: bins of kappa, odd."""
+    wheel: float = 9.0
+    """Steering: largest |angle| [rad] of the wheel; with `SteeringWheel`'s 0.19 1/m."""
+    wheel_bins: int = 13
+    """Steering: bins of the angle, odd; accelerations are Bicycle's."""
+    steering: SteeringWheel = field(default_factory=SteeringWheel)
+    """Steering: from the wheel's angle to curvature."""
     forward: float = 3.0
     """Delta: largest dx ahead [m] in one step (30 m/s at 10 Hz); none backwards."""
     forward_bins: int = 16
@@ -179,7 +248,7 @@ class ActionConfig:
 
     def __post_init__(self) -> None:
         """Refuses grids without a zero."""
-        for name in ("acceleration", "curvature", "sideways", "turn"):
+        for name in ("acceleration", "curvature", "wheel", "sideways", "turn"):
             bins = getattr(self, f"{name}_bins")
             if bins < 1 or bins % 2 == 0:
                 raise ValueError(f"{name}_bins={bins} must be odd, or no bin is zero")
@@ -189,6 +258,8 @@ class ActionConfig:
         """Number of actions."""
         if self.space == ActionSpace.BICYCLE:
             return self.acceleration_bins * self.curvature_bins
+        if self.space == ActionSpace.STEERING:
+            return self.acceleration_bins * self.wheel_bins
         return self.forward_bins * self.sideways_bins * self.turn_bins
 
 
@@ -198,6 +269,11 @@ def action_table(config: ActionConfig) -> Float[np.ndarray, "actions components"
         axes = [
             _squared_bins(config.acceleration, config.acceleration_bins),
             _squared_bins(config.curvature, config.curvature_bins),
+        ]
+    elif config.space == ActionSpace.STEERING:
+        axes = [
+            _squared_bins(config.acceleration, config.acceleration_bins),
+            _squared_bins(config.wheel, config.wheel_bins),
         ]
     else:
         axes = [
@@ -230,6 +306,9 @@ def apply_continuous(
     """One step with any action of the grid's space; Delta's in the object's frame."""
     if config.space == ActionSpace.BICYCLE:
         return bicycle(state, limit_reverse(state, action, dt), dt)
+    if config.space == ActionSpace.STEERING:
+        limited = limit_reverse(state, action, dt)
+        return steering(state, limited, config.steering, dt)
     return delta(state, _turned(action, state.yaw), dt)
 
 
@@ -255,3 +334,25 @@ def _turned(action: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, 
             action[2],
         ]
     )
+
+
+def inverse(
+    state: ObjectState, following: ObjectState, config: ActionConfig, dt: float
+) -> Float[Array, " components"]:
+    """The continuous action of `config.space` that leads to the following state."""
+    if config.space == ActionSpace.BICYCLE:
+        return bicycle_inverse(state, following, dt)
+    if config.space == ActionSpace.STEERING:
+        return steering_inverse(state, following, config.steering, dt)
+    return delta_inverse(state, following)
+
+
+def replay(
+    state: ObjectState, following: ObjectState, config: ActionConfig, dt: float
+) -> ObjectState:
+    """Follows the log from `state` through the continuous space of `config.space`."""
+    if config.space == ActionSpace.BICYCLE:
+        return bicycle_replay(state, following, dt)
+    if config.space == ActionSpace.STEERING:
+        return steering_replay(state, following, config.steering, dt)
+    return delta(state, delta_inverse(state, following), dt)

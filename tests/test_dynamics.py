@@ -19,13 +19,20 @@ ANGLES = st.floats(-3.125, 3.125, width=32)
 SPEEDS = st.floats(0.75, 30, width=32)
 BICYCLE = ActionConfig()
 DELTA = ActionConfig(space=ActionSpace.DELTA)
-GRIDS = pytest.mark.parametrize("config", [BICYCLE, DELTA], ids=["bicycle", "delta"])
+STEERING = ActionConfig(space=ActionSpace.STEERING)
+GRIDS = pytest.mark.parametrize(
+    "config", [BICYCLE, DELTA, STEERING], ids=["bicycle", "delta", "steering"]
+)
 
 bicycle = jax.jit(dynamics.bicycle, static_argnums=2)
 bicycle_inverse = jax.jit(dynamics.bicycle_inverse, static_argnums=2)
+steering = jax.jit(dynamics.steering, static_argnums=(2, 3))
+steering_inverse = jax.jit(dynamics.steering_inverse, static_argnums=(2, 3))
 delta = jax.jit(dynamics.delta, static_argnums=2)
 delta_inverse = jax.jit(dynamics.delta_inverse)
 limit_reverse = jax.jit(dynamics.limit_reverse, static_argnums=2)
+inverse = jax.jit(dynamics.inverse, static_argnums=(2, 3))
+replay = jax.jit(dynamics.replay, static_argnums=(2, 3))
 apply_discrete = jax.jit(dynamics.apply_discrete, static_argnums=(2, 3))
 nearest_action = jax.jit(dynamics.nearest_action, static_argnums=2)
 
@@ -182,6 +189,28 @@ def test_steering_wheel_and_curvature_are_inverse(wheel, axle, ratio) -> None:
     assert float(back) == pytest.approx(wheel, abs=1e-3)
 
 
+@given(PLACES, PLACES, ANGLES, PLACES, PLACES, ANGLES, PLACES, PLACES)
+@settings(max_examples=50, deadline=None)
+def test_playback_takes_the_state(x, y, yaw, to_x, to_y, to_yaw, v_x, v_y) -> None:
+    before, after = state(x, y, yaw, 1, 2), state(to_x, to_y, to_yaw, v_x, v_y)
+    assert dynamics.playback(before, dynamics.playback_inverse(before, after)) == after
+
+
+@given(PLACES, PLACES, ANGLES, SPEEDS, st.floats(-6, 6), st.floats(-9, 9))
+@settings(max_examples=100, deadline=None)
+def test_steering_forward_undoes_its_inverse(x, y, yaw, speed, a, angle) -> None:
+    a = max(a, (0.75 - speed) / DT)
+    before, wheel = driving(x, y, yaw, speed), STEERING.steering
+    action = jnp.array([a, angle], jnp.float32)
+    after = steering(before, action, wheel, DT)
+    kappa = np.sin(angle / wheel.steer_ratio) / wheel.axle_distance
+    assert_same(after, bicycle(before, jnp.array([a, kappa], jnp.float32), DT), 1e-4)
+    found = steering_inverse(before, after, wheel, DT)
+    assert float(found[0]) == pytest.approx(a, abs=1e-3)
+    assert float(found[1]) == pytest.approx(angle, abs=1e-2)
+    assert_same(steering(before, found, wheel, DT), after, atol=1e-3)
+
+
 def test_a_curvature_beyond_the_wheel_is_clipped() -> None:
     wheel = dynamics.curvature_to_steering(jnp.float32(2.0), 3.0, 15.0)
     assert float(wheel) == pytest.approx(15.0 * np.pi / 2)
@@ -195,6 +224,7 @@ def test_grids_have_a_zero_and_reach_their_limits(config: ActionConfig) -> None:
     assert len(np.unique(table, axis=0)) == config.count
     limits = {
         ActionSpace.BICYCLE: (config.acceleration, config.curvature),
+        ActionSpace.STEERING: (config.acceleration, config.wheel),
         ActionSpace.DELTA: (config.forward, config.sideways, config.turn),
     }[config.space]
     np.testing.assert_allclose(table.max(0), limits, rtol=1e-6)
@@ -231,10 +261,7 @@ def test_a_grids_own_action_is_found_again(config: ActionConfig) -> None:
     before = driving(1, 2, 0.7, 8)
     for index in range(0, config.count, 5):
         after = apply_discrete(before, jnp.int32(index), config, DT)
-        if config.space == ActionSpace.BICYCLE:
-            action = bicycle_inverse(before, after, DT)
-        else:
-            action = delta_inverse(before, after)
+        action = inverse(before, after, config, DT)
         assert int(nearest_action(before, action, config)) == index
 
 
@@ -257,7 +284,8 @@ def test_discrete_bicycle_stands_rather_than_reverses() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["acceleration_bins", "curvature_bins", "sideways_bins", "turn_bins"]
+    "name",
+    ["acceleration_bins", "curvature_bins", "wheel_bins", "sideways_bins", "turn_bins"],
 )
 @pytest.mark.parametrize("bins", [0, 4, -1])
 def test_grids_without_a_zero_are_refused(name: str, bins: int) -> None:
