@@ -8,7 +8,7 @@
 - `stop_position`: where each stop sign's lanes cross it.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -199,6 +199,7 @@ def _angle(direction: Float[np.ndarray, "2"]) -> Float[np.ndarray, ""]:
     return np.asarray(np.arctan2(direction[1], direction[0]))
 
 
+@final
 class _Table:
     """The chunks of a scene's lanes that some object's paths use."""
 
