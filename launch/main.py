@@ -108,6 +108,12 @@ def _pipeline(words: list[str], prog: str) -> int:
     return pipeline_command(_parse(PipelineConfig, words, prog))
 
 
+def _sim(words: list[str], prog: str) -> int:
+    from launch.bench_sim import SimConfig, sim_command
+
+    return sim_command(_parse(SimConfig, words, prog))
+
+
 def _doctor(words: list[str], prog: str) -> int:
     from launch.doctor import DoctorConfig, doctor_command
 
@@ -134,6 +140,7 @@ COMMANDS: Final = {
     "scenes info": Command("says what a bank or scene files hold", _info),
     "scenes procedural": Command("generates scenes into a bank", _procedural),
     "view": Command("shows a run in progress or a recording", _view),
+    "bench sim": Command("measures the simulator", _sim),
     "bench pipeline": Command("measures a run of the quick preset", _pipeline),
     "replay": Command("one role of a run: the replay service", _role),
     "actor": Command("one role of a run: an actor", _role),

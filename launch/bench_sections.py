@@ -1,0 +1,67 @@
+"""The sections of `slipstream bench sim`, as the measuring processes run them."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from launch import bench_bicycle, bench_table6
+from launch.bench_scenes import Source
+from launch.bench_table6 import Work
+from launch.bench_timing import yardsticks
+from launch.scenes import say
+
+Request = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured; travels to the measuring processes."""
+
+    objects: tuple[int, ...]  # slots of table 6 and the oracle
+    batches: tuple[int, ...]
+    seconds: float  # per timed program
+
+
+def source_from(request: Request) -> Source:
+    """The scenes that were asked for."""
+    source = request["source"]
+    return Source(source["kind"], tuple(source["main"]), tuple(source["logs"]))
+
+
+def work_from(request: Request, folder: Path) -> Work:
+    """What the sections on table 6 work with."""
+    sizes = request["sizes"]
+    return Work(
+        scene=source_from(request).scene(),
+        folder=folder,
+        objects=tuple(sizes["objects"]),
+        batches=tuple(sizes["batches"]),
+        seconds=sizes["seconds"],
+        say=say,
+    )
+
+
+def _yardsticks(request: Request, folder: Path) -> Iterator[Any]:
+    yield yardsticks(seconds=max(request["sizes"]["seconds"], 0.1))
+
+
+def _table6(request: Request, folder: Path) -> Iterator[Any]:
+    return bench_table6.table6(work_from(request, folder))
+
+
+def _oracle(request: Request, folder: Path) -> Iterator[Any]:
+    return bench_table6.oracle(work_from(request, folder))
+
+
+def _bicycle(request: Request, folder: Path) -> Iterator[Any]:
+    return bench_bicycle.bicycle(source_from(request).scenes())
+
+
+SECTIONS: Final[dict[str, Callable[[Request, Path], Iterator[Any]]]] = {
+    "yardsticks": _yardsticks,
+    "table6": _table6,
+    "oracle": _oracle,
+    "bicycle": _bicycle,
+}
+ONE_CORE: Final = frozenset({"yardsticks"})  # the others have all cores

@@ -1,0 +1,161 @@
+"""`slipstream bench sim`: how fast and how exact the simulator is, on this machine.
+
+Sections, each of which can be had alone: `table6` (Gulino et al., 2023, appendix A.3,
+with its figures 4 and 5), `oracle` (the same work by brute force in the same run),
+`bicycle` (the one-step error on logs). Figures are ratios within one run where they
+are to hold on another machine; every run says what machine it was.
+
+Each section runs in a process of its own (`launch.bench_child`). Files are written at
+the end, each whole or not at all.
+"""
+
+import dataclasses
+import datetime
+import importlib.util
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from launch import bench_child, bench_print
+from launch.bench_scenes import description, source_of
+from launch.bench_sections import ONE_CORE, Sizes
+from launch.config import write_atomically
+from launch.errors import LaunchError
+from launch.evaluate import printer
+
+FORMAT: Final = 1
+Section = Literal["table6", "oracle", "bicycle"]
+ALL: Final[tuple[Section, ...]] = ("table6", "oracle", "bicycle")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimConfig:
+    """Measures the simulator."""
+
+    scenes: tuple[str, ...] = ()
+    """Files or folders of recorded scenes, or `procedural`; the one with the most road
+    points is measured. By default, of the folder named by SLIPSTREAM_DATA, the scene in
+    WOMD's tf.Example form; without that, a procedural one."""
+    sections: tuple[Section, ...] = ALL
+    """What is measured."""
+    quick: bool = False
+    """The smallest sizes, briefly: tries everything, measures nothing well."""
+    objects: tuple[int, ...] = (8, 16, 32, 64, 128)
+    """Object slots of table 6 and the oracle."""
+    batches: tuple[int, ...] = (1, 16)
+    """Batch sizes of table 6."""
+    seconds: float = 0.5
+    """How long each program is timed."""
+    json: str = ""
+    """Writes everything to this file, or to standard output by -."""
+    plot: str = ""
+    """Writes the figures to this folder, as PNG and SVG."""
+
+    def __post_init__(self) -> None:
+        """Refuses sizes of nothing."""
+        counts = (*self.objects, *self.batches)
+        if not self.objects or not self.batches or min(counts) < 1:
+            raise ValueError("objects and batches need numbers of at least 1")
+        if self.seconds <= 0:
+            raise ValueError(f"seconds={self.seconds} must be above 0")
+
+    @property
+    def sizes(self) -> Sizes:
+        """How much is measured."""
+        if self.quick:
+            return Sizes(objects=self.objects[:1], batches=(1,), seconds=0.02)
+        return Sizes(self.objects, self.batches, self.seconds)
+
+
+def sim_command(options: SimConfig) -> int:
+    """`slipstream bench sim`."""
+    _check_outputs(options)
+    source = source_of(options.scenes)
+    report: dict[str, Any] = {
+        "format": FORMAT,
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "load_average": list(os.getloadavg()),
+        "scene": description(source, source.scene()),
+        "sizes": dataclasses.asdict(options.sizes),
+    }
+    request = {
+        "source": dataclasses.asdict(source),
+        "sizes": dataclasses.asdict(options.sizes),
+    }
+    quiet = options.json == "-"
+    console = printer()
+    (report["yardsticks"],) = _measured("yardsticks", request)
+    if not quiet:
+        console.print(_words(report["scene"]))
+        console.print(bench_print.yardsticks_table(report))
+    report["sections"] = {}
+    for name in ALL:
+        if name not in options.sections:
+            continue
+        rows = report["sections"][name] = _measured(name, request)
+        for table in bench_print.section_tables(name, rows):
+            if not quiet:
+                console.print(table)
+    report["targets"] = bench_print.targets(report["sections"])
+    if report["targets"] and not quiet:
+        console.print(bench_print.targets_table(report["targets"]))
+    _write(options, report)
+    return 0
+
+
+def _measured(section: str, request: dict[str, Any]) -> list[Any]:
+    return list(bench_child.run(section, request, one_core=section in ONE_CORE))
+
+
+def _words(scene: dict[str, Any]) -> str:
+    return (
+        f"{scene['kind']} scene {scene['id']}: {scene['objects']} objects, "
+        f"{scene['steps']} steps, {scene['road_points']:,} road points, "
+        f"{scene['road_edge_points']:,} of them on road edges"
+    )
+
+
+def _check_outputs(options: SimConfig) -> None:
+    """Refuses what could not be written, before minutes of measuring."""
+    if options.json and options.json != "-":
+        path = Path(options.json)
+        if path.is_dir():
+            raise LaunchError(f"--json {path}: is a folder; name a file")
+        _check_writable(path.parent, f"--json {path}")
+    if options.plot:
+        _check_writable(Path(options.plot), f"--plot {options.plot}")
+        if importlib.util.find_spec("matplotlib") is None:
+            raise LaunchError(
+                "--plot needs matplotlib, which is not installed; "
+                "pip install 'slipstream[learner]'"
+            )
+
+
+def _check_writable(folder: Path, what: str) -> None:
+    """Whether a folder can be written to, or made."""
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir():
+        raise LaunchError(f"{what}: {there} is not a folder; choose another path")
+    if not os.access(there, os.W_OK):
+        raise LaunchError(f"{what}: {there} cannot be written; choose another path")
+
+
+def _write(options: SimConfig, report: dict[str, Any]) -> None:
+    if options.plot:
+        from launch.bench_figures import figures
+
+        folder = Path(options.plot)
+        drawn = figures(report)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in drawn.items():
+            write_atomically(folder / name, data)
+    text = json.dumps(report, indent=1)
+    if options.json == "-":
+        print(text)
+    elif options.json:
+        Path(options.json).parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(Path(options.json), (text + "\n").encode())
