@@ -16,7 +16,8 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from launch.errors import LaunchError
-from sim.bank import BankFile, open_bank, write_bank
+from sim.bank import BankFile, open_bank
+from sim.bank_writer import write_bank
 from sim.formats import Format, detect, list_files, read_scenes
 from sim.procedural import generate_many
 from sim.scene import Scene

@@ -5,7 +5,6 @@ generated. What a folder holds besides scenes is passed over with a word.
 """
 
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -20,7 +19,8 @@ from rich.table import Table
 
 from launch.config import ScenesConfig
 from launch.errors import LaunchError
-from sim.bank import BankFile, is_bank, open_bank, write_bank
+from sim.bank import BankFile, is_bank, open_bank
+from sim.bank_writer import write_bank
 from sim.formats import list_files, read_scenes
 from sim.procedural import generate_many
 from sim.scene import Scene
@@ -47,7 +47,7 @@ def _counted(scenes: Iterable[Scene], path: Path) -> None:
                 status.update(f"{path.name}: {count} scenes")
 
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_bank(scenes, path, progress=progress, workers=os.cpu_count() or 1)
+        write_bank(scenes, path, progress=progress)
 
 
 def write_procedural(path: Path, *, count: int, seed: int) -> BankFile:

@@ -5,28 +5,25 @@ different lengths stand one behind the other with the scene's first row in a `_s
 array, so that a reset is a change of index. Positions are local to the scene: its
 origin, kept in double precision, is subtracted before anything is rounded to float32.
 
-File: the magic, the header's length (uint64, little-endian), the header (JSON: version,
-sizes, scenario ids, origins, one {name, dtype, shape, offset} per array, the SHA-256 of
-all this and of the data), then the arrays, each at a multiple of `ALIGNMENT` so that
-JAX on a CPU can use the mapped pages as they are.
+File: the magic, the header's length (uint64, little-endian), the header (JSON,
+`Header`), then the arrays, each at a multiple of `ALIGNMENT` so that JAX on a CPU can
+use the mapped pages as they are. `sim.bank_writer` writes it.
 """
 
 import hashlib
-import json
 import math
 import mmap
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
+import msgspec
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
-
-from sim import convert
-from sim.scene import Scene
 
 MAGIC = b"SLIPBANK"
 VERSION = 3
@@ -76,9 +73,48 @@ class Bank(NamedTuple):
     segments: Float[Array, "segments 4"]  # m, x0 y0 x1 y1
     segment_kind: Int[Array, " segments"]  # `RoadKind`
     cell_edges: Int[Array, " cells"]  # -1 drivable, -2 not, else row of `fine_state`
-    fine_state: Int[Array, "mixed parts"]  # -1, -2, else row of `fine_edges`
-    fine_edges: Int[Array, "decisive candidates"]  # rows of `edges`, repeated to fill
+    fine_start: Int[Array, " scenes"]  # first row of `fine_state`; rows are the scene's
+    fine_state: Int[Array, "mixed parts"]  # -1, -2, else list of candidates
+    list_start: Int[Array, " scenes"]  # first list; lists too are the scene's own
+    list_first: Int[Array, " lists"]  # a list's first element of `list_edges`
+    list_count: UInt[Array, " lists"]  # how many it has
+    list_edges: Int[Array, " elements"]  # rows of `edges`, of the scene's own
+    candidates: Int[Array, " longest"]  # 0, 1, ...: as many as the longest list has
+    edge_start: Int[Array, " scenes"]  # first row of `edges`
     edges: Float[Array, "edges 10"]  # m, `sim.edge_table.Edges.packed`
+
+
+class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where in the file an array is."""
+
+    name: str
+    dtype: str  # numpy's name of the type, with the byte order
+    shape: tuple[Annotated[int, msgspec.Meta(ge=0)], ...]
+    offset: Annotated[int, msgspec.Meta(ge=0)]  # bytes from the start of the data
+
+    @property
+    def size(self) -> int:
+        """Bytes of the array."""
+        return math.prod(self.shape) * np.dtype(self.dtype).itemsize
+
+
+class Header(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """All that a bank says besides its arrays."""
+
+    version: int
+    sha256: str  # `digest_of` the header and the arrays, hexadecimal
+    bytes: int  # of the data, a multiple of `ALIGNMENT`
+    dt: float  # s
+    arrays: tuple[Entry, ...]
+    scenario_ids: tuple[str, ...]
+    origins: tuple[tuple[float, float, float], ...]  # m, map frame
+    dropped: tuple[int, ...]  # objects of each scene that there was no slot for
+
+
+class _Versioned(msgspec.Struct):
+    """What headers of all versions have."""
+
+    version: int
 
 
 @dataclass(frozen=True)
@@ -86,11 +122,28 @@ class BankFile:
     """An opened bank. `arrays` are read-only views of the mapped file."""
 
     path: Path
-    content_hash: str  # SHA-256 of all that it says, hexadecimal
-    scenario_ids: tuple[str, ...]
-    origins: tuple[tuple[float, float, float], ...]  # m, map frame
-    dt: float  # s
+    header: Header
     arrays: dict[str, np.ndarray]
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of all that it says, hexadecimal."""
+        return self.header.sha256
+
+    @property
+    def scenario_ids(self) -> tuple[str, ...]:
+        """The scenes' ids, by row."""
+        return self.header.scenario_ids
+
+    @property
+    def origins(self) -> tuple[tuple[float, float, float], ...]:
+        """Each scene's origin in the map's frame [m]."""
+        return self.header.origins
+
+    @property
+    def dt(self) -> float:
+        """Seconds between two steps."""
+        return self.header.dt
 
     @property
     def scenes(self) -> int:
@@ -103,106 +156,18 @@ class BankFile:
         return Bank(**jax.device_put(self.arrays))
 
 
-def write_bank(
-    scenes: Iterable[Scene],
-    path: Path,
-    *,
-    progress: Callable[[int], None] | None = None,
-    workers: int = 1,
-) -> None:
-    """Converts scenes and writes them under `path` only once the file is whole.
+def digest_of(header: Header, digests: Iterable[bytes]) -> str:
+    """SHA-256, hexadecimal, of a header (without its hash) and its arrays' SHA-256.
 
-    Args:
-        scenes: any number; all of one step length.
-        path: the bank's file; a partial one beside it is renamed at the end.
-        progress: told how many scenes are converted.
-        workers: processes that convert. More than one are spawned, so the caller's main
-            module must be guarded by `if __name__ == "__main__"`.
+    Of the arrays' hashes and not of the arrays, as they are written, and can be read,
+    all at once.
     """
-    ids, origins, dts = [], [], set()
-
-    def noted() -> Iterator[Scene]:
-        for scene in scenes:
-            ids.append(scene.scenario_id)
-            origins.append(tuple(float(value) for value in convert.origin_of(scene)))
-            dts.add(round(scene.dt, 6))
-            yield scene
-
-    converted = []
-    for part in convert.convert_all(noted(), workers=workers):
-        converted.append(part)
-        if progress:
-            progress(len(converted))
-    if not converted:
-        raise BankError(f"{path}: no scene to write; name at least one scene")
-    if len(dts) > 1:
-        raise BankError(
-            f"{path}: scenes of different step lengths {sorted(dts)} s; "
-            "convert them into banks of their own"
-        )
-    arrays = convert.stack(converted)
-    _write_file(
-        path, arrays, {"scenario_ids": ids, "origins": origins, "dt": dts.pop()}
+    found = hashlib.sha256(
+        msgspec.json.encode(msgspec.structs.replace(header, sha256=""))
     )
-
-
-def _write_file(
-    path: Path, arrays: dict[str, np.ndarray], description: dict[str, Any]
-) -> None:
-    arrays = {name: np.ascontiguousarray(arrays[name]) for name in Bank._fields}
-    entries: list[dict[str, Any]] = []
-    places: list[int] = []
-    end = 0
-    for name, data in arrays.items():
-        entries.append(
-            {"name": name, "dtype": data.dtype.str, "shape": data.shape, "offset": end}
-        )
-        places.append(end)
-        end += _aligned(data.nbytes)
-    header = json.dumps(
-        {
-            "version": VERSION,
-            "sha256": _digest(arrays, description),
-            "bytes": end,
-            "arrays": entries,
-            **description,
-        }
-    ).encode()
-    start = _aligned(len(MAGIC) + 8 + len(header))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with open(temporary, "wb") as file:
-                file.write(MAGIC + len(header).to_bytes(8, "little") + header)
-                for place, data in zip(places, arrays.values(), strict=True):
-                    file.seek(start + place)
-                    file.write(_bytes(data))
-                file.truncate(start + end)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as error:
-        raise BankError(f"cannot write bank {path}: {error.strerror}") from error
-
-
-def _bytes(data: np.ndarray) -> memoryview:
-    """The array's memory; a view of no element cannot be cast."""
-    return data.data.cast("B") if data.size else memoryview(b"")
-
-
-def _digest(arrays: dict[str, np.ndarray], description: dict[str, Any]) -> str:
-    """SHA-256 of all that a bank says: names, types, shapes, description and data."""
-    shapes = [
-        (name, arrays[name].dtype.str, arrays[name].shape) for name in Bank._fields
-    ]
-    text = json.dumps([VERSION, shapes, sorted(description.items())])
-    digest = hashlib.sha256(text.encode())
-    for name in Bank._fields:
-        digest.update(_bytes(arrays[name]))
-    return digest.hexdigest()
+    for digest in digests:
+        found.update(digest)
+    return found.hexdigest()
 
 
 def open_bank(path: Path) -> BankFile:
@@ -217,40 +182,33 @@ def open_bank(path: Path) -> BankFile:
         ) from error
     header, start = _read_header(path, mapped)
     try:
-        bank = BankFile(
-            path=path,
-            content_hash=str(header["sha256"]),
-            scenario_ids=tuple(str(name) for name in header["scenario_ids"]),
-            origins=tuple(
-                (float(x), float(y), float(z)) for x, y, z in header["origins"]
-            ),
-            dt=float(header["dt"]),
-            arrays={
-                str(entry["name"]): _array(mapped, start, entry)
-                for entry in header["arrays"]
-            },
-        )
-    except (ValueError, KeyError, TypeError, OverflowError, SyntaxError) as error:
+        arrays = {
+            entry.name: _array(mapped, start, entry, header.bytes)
+            for entry in header.arrays
+        }
+    except (ValueError, TypeError, OverflowError, SyntaxError) as error:
         raise _broken(path) from error
-    if set(bank.arrays) != set(Bank._fields):
+    if set(arrays) != set(Bank._fields):
         raise BankError(f"bank {path} lacks arrays; convert its scenes again")
-    return bank
+    if len({len(header.scenario_ids), len(header.origins), len(header.dropped)}) > 1:
+        raise _broken(path)
+    return BankFile(path, header, arrays)
 
 
-def _array(mapped: mmap.mmap, start: int, entry: dict[str, Any]) -> np.ndarray:
+def _array(mapped: mmap.mmap, start: int, entry: Entry, size: int) -> np.ndarray:
     """A view of one array of the file."""
-    dtype, shape = np.dtype(entry["dtype"]), tuple(entry["shape"])
-    if entry["offset"] < 0 or any(length < 0 for length in shape):
+    if entry.offset % ALIGNMENT or entry.offset + entry.size > size:
         raise ValueError("an array outside of the data")
-    flat = np.frombuffer(mapped, dtype, math.prod(shape), start + entry["offset"])
-    return flat.reshape(shape)
+    dtype, offset = np.dtype(entry.dtype), start + entry.offset
+    flat = np.frombuffer(mapped, dtype, math.prod(entry.shape), offset)
+    return flat.reshape(entry.shape)
 
 
 def _broken(path: Path) -> BankError:
     return BankError(f"bank {path}: broken header; convert its scenes again")
 
 
-def _read_header(path: Path, mapped: mmap.mmap) -> tuple[dict[str, Any], int]:
+def _read_header(path: Path, mapped: mmap.mmap) -> tuple[Header, int]:
     """The header and the byte offset at which the data start."""
     if mapped[: len(MAGIC)] != MAGIC:
         raise BankError(f"{path} is not a bank; make one with `slipstream scenes`")
@@ -260,31 +218,38 @@ def _read_header(path: Path, mapped: mmap.mmap) -> tuple[dict[str, Any], int]:
             f"bank {path} is truncated at byte {len(mapped)}, within its header; "
             "convert its scenes again"
         )
+    text = mapped[16 : 16 + length]
     try:
-        header = json.loads(mapped[16 : 16 + length])
-        version, size = header["version"], int(header["bytes"])
-    except (ValueError, KeyError, TypeError) as error:
+        version = msgspec.json.decode(text, type=_Versioned).version
+        if version != VERSION:
+            raise BankError(
+                f"bank {path} has version {version}, this program reads {VERSION}; "
+                "convert its scenes again"
+            )
+        header = msgspec.json.decode(text, type=Header)
+    except (msgspec.MsgspecError, ValueError) as error:
         raise _broken(path) from error
-    if version != VERSION:
+    start = aligned(16 + length)
+    if len(mapped) != start + header.bytes:
         raise BankError(
-            f"bank {path} has version {version}, this program reads {VERSION}; "
-            "convert its scenes again"
-        )
-    start = _aligned(16 + length)
-    if len(mapped) != start + size:
-        raise BankError(
-            f"bank {path} is truncated: {len(mapped)} bytes of {start + size}; "
-            "convert its scenes again"
+            f"bank {path} is truncated: {len(mapped)} bytes of "
+            f"{start + header.bytes}; convert its scenes again"
         )
     return header, start
 
 
 def verify(file: BankFile) -> None:
     """Reads every byte and compares the hash; BankError if they differ."""
-    found = _digest(
-        file.arrays,
-        {"scenario_ids": file.scenario_ids, "origins": file.origins, "dt": file.dt},
-    )
+
+    def digest(entry: Entry) -> bytes:
+        # An empty array cannot be cast to bytes.
+        array = file.arrays[entry.name]
+        data = array.data.cast("B") if array.size else b""
+        return hashlib.sha256(data).digest()
+
+    # hashlib lets other threads run meanwhile.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = digest_of(file.header, pool.map(digest, file.header.arrays))
     if found != file.content_hash:
         raise BankError(
             f"bank {file.path} is damaged: its content hashes to {found}, its "
@@ -301,5 +266,6 @@ def is_bank(path: Path) -> bool:
         return False
 
 
-def _aligned(size: int) -> int:
+def aligned(size: int) -> int:
+    """The next multiple of `ALIGNMENT`."""
     return -(-size // ALIGNMENT) * ALIGNMENT

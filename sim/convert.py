@@ -1,24 +1,18 @@
 """From a `Scene` to the rows of the bank (`sim.bank.Bank` says what each means)."""
 
-import itertools
-import multiprocessing
-from collections import deque
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt
 
 from sim import edge_table, routes, tables
 from sim.scene import Scene, SceneError
 
-Converted = dict[str, Any]  # one scene's part of every array of the bank
+Converted = dict[str, np.ndarray]  # one scene's part of every array of the bank
 
 LOG_FIELDS = ("x", "y", "z", "yaw", "v_x", "v_y", "length", "width")
 LIGHT_THROUGH = 15.0  # m behind a light's line at which lanes that part are apart
 ROWS = 64  # road segments kept per cell
-FEW = 12  # scenes
 MAX_CANDIDATES = 64  # edges per fine cell; measured: 12 to 30 at the 99th percentile
 
 
@@ -41,21 +35,24 @@ def convert(scene: Scene) -> Converted:
     row_of, rows, counts = tables.row_table(grid, segments, ROWS)
     edges = edge_table.edges_of(scene.roads)
     state, candidates = edge_table.edge_table(grid, edges, ground)
-    fine, fine_edges = _candidate_rows(state, candidates)
-    cell_edges, fine_state = _nested(fine.reshape(grid.fine.shape))
+    lists = _candidate_lists(state, candidates)
+    cell_edges, fine_state = _nested(lists.state.reshape(grid.fine.shape))
+    route = routes.routes_of(scene, origin)
     return {
-        "current_step": np.int32(scene.current_step),
-        "steps": np.int32(scene.steps),
-        "objects": np.int32(scene.objects),
-        "sdc": np.int32(scene.sdc_index),
+        "current_step": np.array(scene.current_step, np.int32),
+        "steps": np.array(scene.steps, np.int32),
+        "objects": np.array(scene.objects, np.int32),
+        "sdc": np.array(scene.sdc_index, np.int32),
         "tracks": np.array(scene.tracks_to_predict, np.int32),
         "log": log,
         "log_valid": valid,
         "object_type": scene.object_types.astype(np.int8),
-        **routes.routes_of(scene, origin),
+        **route,
+        "stops": np.array(len(route["stop_position"]), np.int32),
         "light_position": (scene.lights.stop_points - origin)[:, :2].astype(np.float32),
         "light_through": (_lights_through(scene) - origin[:2]).astype(np.float32),
         "light_state": scene.lights.states.T.astype(np.int8),
+        "lights": np.array(len(scene.lights.lane_ids), np.int32),
         "grid_origin": (grid.origin - origin[:2]).astype(np.float32),
         "grid_shape": np.array(grid.shape, np.int32),
         "segments": (segments - np.tile(origin[:2], 2)).astype(np.float32),
@@ -65,32 +62,11 @@ def convert(scene: Scene) -> Converted:
         "row_count": counts,
         "cell_edges": cell_edges,
         "fine_state": fine_state,
-        "fine_edges": fine_edges,
+        "list_first": lists.first,
+        "list_count": lists.length,
+        "list_edges": lists.edges,
         "edges": _moved(edges, origin).packed(),
     }
-
-
-def convert_all(scenes: Iterable[Scene], *, workers: int) -> Iterator[Converted]:
-    """Converts scenes in order, several at once in processes of their own.
-
-    The processes start only when `FEW` scenes have come: until then they cost more than
-    they save. At most a few scenes per process wait, however many there are.
-    """
-    source = iter(scenes)
-    first = list(itertools.islice(source, FEW))
-    if workers < 2 or len(first) < FEW:
-        yield from map(convert, itertools.chain(first, source))
-        return
-    # Spawned, not forked: JAX's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        pending: deque[Future[Converted]] = deque()
-        for scene in itertools.chain(first, source):
-            pending.append(pool.submit(convert, scene))
-            if len(pending) > 4 * workers:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
 
 
 def _check_small(scene: Scene, what: str, count: int, limit: int) -> None:
@@ -156,23 +132,37 @@ def _lights_through(scene: Scene) -> Float[np.ndarray, "lights 2"]:
     return through
 
 
-def _candidate_rows(
-    state: Int[np.ndarray, " fine"], candidates: list[Int[np.ndarray, " _"]]
-) -> tuple[Int[np.ndarray, " fine"], Int[np.ndarray, "mixed width"]]:
-    """A row of candidates per mixed fine cell, and each fine cell's row or verdict.
+class _Lists(NamedTuple):
+    """What `_candidate_lists` finds; a list is a range of `edges`."""
 
-    A list shorter than the longest repeats its first edge, which changes no minimum.
+    state: Int[np.ndarray, " fine"]  # each fine cell's verdict or list
+    first: Int[np.ndarray, " lists"]  # element of `edges` that a list begins with
+    length: UInt[np.ndarray, " lists"]
+    edges: Int[np.ndarray, " candidates"]  # rows of the scene's edges
+
+
+def _candidate_lists(
+    state: Int[np.ndarray, " fine"], candidates: list[Int[np.ndarray, " _"]]
+) -> _Lists:
+    """The candidates of the mixed fine cells, each list of edges once.
+
+    Cells side by side mostly have the same candidates, in another order of distance;
+    in the order of their rows they are one list (measured: a third to a half fewer).
     """
-    mixed = np.flatnonzero(state == edge_table.MIXED)
-    state[mixed] = np.arange(len(mixed))
-    longest = max((len(candidates[cell]) for cell in mixed), default=1)
-    width = min(longest, MAX_CANDIDATES)
-    rows = np.zeros((len(mixed), width), np.int32)
-    for row, cell in enumerate(mixed):
-        near = candidates[cell][:width]
-        rows[row] = near[0]
-        rows[row, : len(near)] = near
-    return state, rows
+    numbers: dict[bytes, int] = {}
+    lists: list[Int[np.ndarray, " _"]] = []
+    for cell in np.flatnonzero(state == edge_table.MIXED):
+        near = np.sort(candidates[cell][:MAX_CANDIDATES]).astype(np.int32)
+        state[cell] = numbers.setdefault(near.tobytes(), len(lists))
+        if state[cell] == len(lists):
+            lists.append(near)
+    count = np.array([len(near) for near in lists], np.int64)
+    return _Lists(
+        state=state,
+        first=(np.cumsum(count) - count).astype(np.int32),
+        length=count.astype(np.uint8),
+        edges=np.concatenate([np.zeros(0, np.int32), *lists]),
+    )
 
 
 def _nested(
@@ -190,86 +180,3 @@ def _nested(
     mixed = np.flatnonzero((parts[:, :1] != parts).any(1) | (cells >= 0))
     cells[mixed] = np.arange(len(mixed))
     return cells, parts[mixed]
-
-
-def stack(scenes: list[Converted]) -> dict[str, np.ndarray]:
-    """Joins the scenes: padded where fixed, else one behind the other."""
-    steps = max(len(scene["log"]) for scene in scenes)
-    objects = max(scene["log"].shape[1] for scene in scenes)
-    lights = max(1, max(len(scene["light_position"]) for scene in scenes))
-    width = max(scene["fine_edges"].shape[1] for scene in scenes)
-    chunks = max(1, max(scene["path_chunk"].shape[1] for scene in scenes))
-    stops = max(1, max(len(scene["stop_position"]) for scene in scenes))
-    tracks = max(1, max(len(scene["tracks"]) for scene in scenes))
-    shapes = {
-        "tracks": (tracks,),
-        "log": (steps, objects, len(LOG_FIELDS)),
-        "log_valid": (steps, objects),
-        "object_type": (objects,),
-        "route": (objects, routes.ROUTE_POINTS, 2),
-        **dict.fromkeys(routes.PER_OBJECT, (objects,)),
-        **dict.fromkeys(routes.PER_CHUNK, (objects, chunks)),
-        "stop_position": (stops, 2),
-        "light_position": (lights, 2),
-        "light_through": (lights, 2),
-        "light_state": (steps, lights),
-    }
-    fill = {"route_spacing": 1.0, "tracks": objects}
-    arrays = {
-        name: np.stack([_padded(s[name], shape, fill.get(name, 0)) for s in scenes])
-        for name, shape in shapes.items()
-    }
-    for name in ("current_step", "steps", "objects", "sdc"):
-        arrays[name] = np.array([scene[name] for scene in scenes], np.int32)
-    for name in ("grid_origin", "grid_shape"):
-        arrays[name] = np.stack([scene[name] for scene in scenes])
-    arrays["lights"] = np.array([len(s["light_position"]) for s in scenes], np.int32)
-    arrays["stops"] = np.array([len(s["stop_position"]) for s in scenes], np.int32)
-    arrays["chunk_start"] = _starts(scenes, "chunks")
-    arrays["segment_start"] = _starts(scenes, "segments")
-    arrays["cell_start"] = _starts(scenes, "cell_row")
-    tables_ = ("segments", "segment_kind", "rows", "row_count", "edges", "chunks")
-    for name in tables_:
-        arrays[name] = np.concatenate([scene[name] for scene in scenes])
-    for name, table in (
-        ("cell_row", "rows"),
-        ("cell_edges", "fine_state"),
-        ("fine_state", "fine_edges"),
-    ):
-        arrays[name] = np.concatenate(
-            [
-                np.where(scene[name] >= 0, scene[name] + first, scene[name])
-                for scene, first in zip(scenes, _starts(scenes, table), strict=True)
-            ]
-        ).astype(np.int32)
-    arrays["fine_edges"] = np.concatenate(
-        [
-            _widened(scene["fine_edges"] + first, width)
-            for scene, first in zip(scenes, _starts(scenes, "edges"), strict=True)
-        ]
-    ).astype(np.int32)
-    # A gather needs a row to read even where no scene has a map of that kind.
-    for name in (*tables_, "fine_state", "fine_edges"):
-        if not len(arrays[name]):
-            empty = arrays[name]
-            arrays[name] = np.zeros((1, *empty.shape[1:]), empty.dtype)
-    return arrays
-
-
-def _starts(scenes: list[Converted], name: str) -> Int[np.ndarray, " scenes"]:
-    lengths = [len(scene[name]) for scene in scenes]
-    return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int32)
-
-
-def _padded(array: np.ndarray, shape: tuple[int, ...], value: float) -> np.ndarray:
-    """`array` in the corner of a larger one, the rest `value`."""
-    pads = [(0, want - have) for want, have in zip(shape, array.shape, strict=True)]
-    return np.pad(array, pads, constant_values=value)
-
-
-def _widened(
-    rows: Int[np.ndarray, "rows have"], width: int
-) -> Int[np.ndarray, "rows want"]:
-    """Rows of candidates filled up with their first, which changes no minimum."""
-    fill = np.repeat(rows[:, :1], width - rows.shape[1], 1)
-    return np.concatenate([rows, fill], 1)

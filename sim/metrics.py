@@ -104,45 +104,61 @@ def _on_left(
     fine = ((point - bank.grid_origin[scene]) / tables.EDGE_CELL).astype(jnp.int32)
     fine = jnp.clip(fine, 0, shape * tables.FINE - 1)
     cell, part = fine // tables.FINE, fine % tables.FINE
-    state = bank.cell_edges[bank.cell_start[scene] + cell[0] * shape[1] + cell[1]]
-    parts = bank.fine_state[jnp.maximum(state, 0), part[0] * tables.FINE + part[1]]
+    number = bank.cell_start[scene] + cell[0] * shape[1] + cell[1]
+    state = bank.cell_edges[number].astype(jnp.int32)
+    square = bank.fine_start[scene] + jnp.maximum(state, 0)
+    parts = bank.fine_state[square, part[0] * tables.FINE + part[1]].astype(jnp.int32)
     state = jnp.where(state >= 0, parts, state)
-    row = bank.edges[bank.fine_edges[jnp.maximum(state, 0)]]
-    left = _left_of_nearest(row, point, z)
+    near = bank.list_start[scene] + jnp.maximum(state, 0)
+    last = bank.list_count[near].astype(jnp.int32) - 1
+    # A list shorter than the longest repeats its last edge, which changes no minimum.
+    at = bank.list_first[near] + jnp.minimum(bank.candidates, last)
+    edges = bank.edge_start[scene] + bank.list_edges[at].astype(jnp.int32)
+    best = edges[_nearest(bank.edges[edges, :6], point, z)]
+    left = _left_of(bank.edges[best], point, z)
     return (state == edge_table.DRIVABLE) | ((state >= 0) & left)
 
 
-def _left_of_nearest(
-    edges: Float[Array, "candidates 10"], point: Float[Array, "2"], z: Float[Array, ""]
-) -> Bool[Array, ""]:
+def _nearest(
+    edges: Float[Array, "candidates 6"], point: Float[Array, "2"], z: Float[Array, ""]
+) -> Int[Array, ""]:
     dx, dy, dz = edges[:, 3], edges[:, 4], edges[:, 5] * edge_table.HEIGHT_WEIGHT
     x, y = point[0] - edges[:, 0], point[1] - edges[:, 1]
     h = (z - edges[:, 2]) * edge_table.HEIGHT_WEIGHT
     squared = jnp.maximum(dx * dx + dy * dy + dz * dz, 1e-12)
     t = jnp.clip((x * dx + y * dy + h * dz) / squared, 0.0, 1.0)
-    distance = (x - t * dx) ** 2 + (y - t * dy) ** 2 + (h - t * dz) ** 2
-    best = jnp.argmin(distance)
+    return jnp.argmin((x - t * dx) ** 2 + (y - t * dy) ** 2 + (h - t * dz) ** 2)
+
+
+def _left_of(
+    edge: Float[Array, "10"], point: Float[Array, "2"], z: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether the point is on the edge's left, where the edge is its nearest one."""
+    dx, dy, dz = edge[3], edge[4], edge[5] * edge_table.HEIGHT_WEIGHT
+    x, y = point[0] - edge[0], point[1] - edge[1]
+    h = (z - edge[2]) * edge_table.HEIGHT_WEIGHT
+    squared = jnp.maximum(dx * dx + dy * dy + dz * dz, 1e-12)
+    t = jnp.clip((x * dx + y * dy + h * dz) / squared, 0.0, 1.0)
     own = _cross(dx, dy, x, y)
     # At a vertex the neighbour's side counts too; both of its ends lie on its line.
-    before = _cross(edges[:, 6], edges[:, 7], x, y)
-    after = _cross(edges[:, 8], edges[:, 9], x - dx, y - dy)
-    turn_before = _cross(edges[:, 6], edges[:, 7], dx, dy)
-    turn_after = _cross(dx, dy, edges[:, 8], edges[:, 9])
+    before = _cross(edge[6], edge[7], x, y)
+    after = _cross(edge[8], edge[9], x - dx, y - dy)
+    turn_before = _cross(edge[6], edge[7], dx, dy)
+    turn_after = _cross(dx, dy, edge[8], edge[9])
     neighbour = jnp.where(t <= 0.0, before, after)
     left_turn = jnp.where(t <= 0.0, turn_before, turn_after) > 0
     both = (own > 0) & (neighbour > 0)
     either = (own > 0) | (neighbour > 0)
     at_vertex = (t <= 0.0) | (t >= 1.0)
-    left = jnp.where(at_vertex, jnp.where(left_turn, both, either), own > 0)
-    return left[best]
+    return jnp.where(at_vertex, jnp.where(left_turn, both, either), own > 0)
 
 
 def _cross(
-    ax: Float[Array, " n"],
-    ay: Float[Array, " n"],
-    bx: Float[Array, " n"],
-    by: Float[Array, " n"],
-) -> Float[Array, " n"]:
+    ax: Float[Array, ""],
+    ay: Float[Array, ""],
+    bx: Float[Array, ""],
+    by: Float[Array, ""],
+) -> Float[Array, ""]:
     return ax * by - ay * bx
 
 

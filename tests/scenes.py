@@ -8,7 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from sim.bank import BankFile, open_bank, write_bank
+from sim.bank import BankFile, open_bank
+from sim.bank_writer import write_bank
 from sim.formats import read_scenes
 from sim.scene import (
     ObjectType,

@@ -131,7 +131,7 @@ def test_a_bank_of_another_version(
     bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = tmp_path / "old.bank"
-    ours, theirs = (f'"version": {number}'.encode() for number in (VERSION, 9))
+    ours, theirs = (f'"version":{number}'.encode() for number in (VERSION, 9))
     old.write_bytes(bank.read_bytes().replace(ours, theirs, 1))
     line = refusal(capsys, "evaluate", "--agent", "expert", "--scenes", old)
     assert "has version 9" in line

@@ -25,7 +25,7 @@ from launch.recording import (
 from launch.scene_view import ViewScene, view_scene_of
 from launch.view import check_recording
 from launch.web import ViewError
-from sim import bank, procedural
+from sim import bank, bank_writer, procedural
 from sim.bank import BankFile
 from sim.dynamics import ActionConfig
 from sim.scene import RoadKind
@@ -39,7 +39,7 @@ ACTIONS = ActionConfig().count
 @pytest.fixture(scope="module")
 def bank_file(tmp_path_factory: pytest.TempPathFactory) -> BankFile:
     path = tmp_path_factory.mktemp("banks") / "three.bank"
-    bank.write_bank(procedural.generate_many(5, 3), path)
+    bank_writer.write_bank(procedural.generate_many(5, 3), path)
     return bank.open_bank(path)
 
 
