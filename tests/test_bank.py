@@ -52,8 +52,8 @@ def data_start(path: Path) -> int:
     return -(-(16 + length) // ALIGNMENT) * ALIGNMENT
 
 
-def copy_with(file: BankFile, folder: Path, content: bytes) -> Path:
-    """A file beside, with other content."""
+def copy_with(folder: Path, content: bytes) -> Path:
+    """A file with this content."""
     path = folder / "copy.bank"
     path.write_bytes(content)
     return path
@@ -68,11 +68,8 @@ def with_header(file: BankFile, folder: Path, **changes: object) -> Path:
     text = json.dumps(header, separators=(",", ":")).encode()
     text = text.ljust(length)  # the data stay where they were
     assert len(text) == length
-    return copy_with(
-        file,
-        folder,
-        MAGIC + length.to_bytes(8, "little") + text + content[16 + length :],
-    )
+    head = MAGIC + length.to_bytes(8, "little")
+    return copy_with(folder, head + text + content[16 + length :])
 
 
 def joined(parts: list[convert.Converted], name: str) -> np.ndarray:
@@ -170,15 +167,15 @@ def test_a_truncated_bank_is_refused(file: BankFile, tmp_path: Path, where) -> N
         "data": (start + 10, "is truncated"),
         "end": (len(content) - 1, "is truncated"),
     }[where]
-    path = copy_with(file, tmp_path, content[:length])
+    path = copy_with(tmp_path, content[:length])
     with pytest.raises(BankError, match=message) as refusal:
         open_bank(path)
     assert str(path) in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 
-def test_bytes_behind_the_end_are_refused(file: BankFile, tmp_path: Path) -> None:
-    path = copy_with(file, tmp_path, file.path.read_bytes() + b"\0")
+def test_bytes_behind_the_end_are_refused(file, tmp_path: Path) -> None:
+    path = copy_with(tmp_path, file.path.read_bytes() + b"\0")
     with pytest.raises(BankError, match="convert its scenes again"):
         open_bank(path)
 
@@ -235,7 +232,7 @@ def test_damage_to_any_part_is_refused_or_found(file, tmp_path: Path) -> None:
     for place in places:
         damaged = bytearray(content)
         damaged[place] ^= 0x10
-        path = copy_with(file, tmp_path, bytes(damaged))
+        path = copy_with(tmp_path, bytes(damaged))
         try:
             verify(open_bank(path))
         except BankError:
@@ -248,7 +245,7 @@ def test_damage_to_any_part_is_refused_or_found(file, tmp_path: Path) -> None:
 def test_a_damaged_byte_is_found_by_verify(file: BankFile, tmp_path: Path) -> None:
     content = bytearray(file.path.read_bytes())
     content[data_start(file.path) + file.arrays["current_step"].nbytes - 1] ^= 1
-    damaged = open_bank(copy_with(file, tmp_path, bytes(content)))
+    damaged = open_bank(copy_with(tmp_path, bytes(content)))
     with pytest.raises(BankError, match="is damaged"):
         verify(damaged)
 
