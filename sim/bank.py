@@ -18,7 +18,7 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, final
 
 import jax
 import msgspec
@@ -84,6 +84,7 @@ class Bank(NamedTuple):
     edges: Float[Array, "edges 10"]  # m, `sim.edge_table.Edges.packed`
 
 
+@final
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where in the file an array is."""
 
@@ -98,6 +99,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return math.prod(self.shape) * np.dtype(self.dtype).itemsize
 
 
+@final
 class Header(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All that a bank says besides its arrays."""
 
@@ -111,6 +113,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     dropped: tuple[int, ...]  # objects of each scene that there was no slot for
 
 
+@final
 class _Versioned(msgspec.Struct):
     """What headers of all versions have."""
 
