@@ -8,14 +8,12 @@ import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import final
 
 import msgspec
 import numpy as np
 
-from sim import convert
 from sim.bank import (
     MAGIC,
     VERSION,
@@ -26,49 +24,19 @@ from sim.bank import (
     aligned,
     digest_of,
 )
-from sim.convert import Converted
 from sim.layout import (
     COUNTED,
     STARTS,
     TABLES,
     Layout,
     LayoutError,
-    Sizes,
     Spec,
     placed,
-    sizes_of,
 )
+from sim.parts import Part, part_of
 from sim.scene import Scene
 
 _BUFFER = 2**20  # bytes
-
-
-@dataclass(frozen=True)
-class Part:
-    """A converted scene: what a bank's header says of it, and where its arrays are."""
-
-    scenario_id: str
-    origin: tuple[float, float, float]  # m, map frame
-    dt: float  # s
-    dropped: int  # objects that there was no slot for
-    dtypes: Mapping[str, np.dtype]
-    sizes: Sizes
-    load: Callable[[], Converted]
-
-
-def part_of(scene: Scene, *, dropped: int = 0) -> Part:
-    """A scene converted, its arrays in memory."""
-    converted = convert.convert(scene)
-    x, y, z = convert.origin_of(scene).tolist()
-    return Part(
-        scenario_id=scene.scenario_id,
-        origin=(x, y, z),
-        dt=round(scene.dt, 6),
-        dropped=dropped,
-        dtypes={name: array.dtype for name, array in converted.items()},
-        sizes=sizes_of(converted),
-        load=lambda: converted,
-    )
 
 
 def write_bank(
@@ -80,7 +48,7 @@ def write_bank(
     """Converts scenes in this process and writes them as a bank.
 
     They must be of one step length and, converted, fit into memory; for more of them
-    there is `launch.conversion`.
+    there is `sim.conversion`.
     """
     parts = []
     for scene in scenes:
@@ -111,9 +79,9 @@ def write_parts(
             f"{path}: scenes of different step lengths {dts} s; "
             "convert them into banks of their own"
         )
-    layout = Layout(parts[0].dtypes)
+    layout = Layout()
     for part in parts:
-        layout.add(part.sizes)
+        layout.add(part.sizes())
     try:
         specs = layout.specs()
     except LayoutError as error:
@@ -180,9 +148,9 @@ class _Stream:
         self.digest.update(self._waiting)
         left = memoryview(self._waiting)
         while left:
-            done = os.pwrite(self._descriptor, left, self._offset + self.written)
-            self.written += done
-            left = left[done:]
+            count = os.pwrite(self._descriptor, left, self._offset + self.written)
+            self.written += count
+            left = left[count:]
         left.release()
         self._waiting = bytearray()
 

@@ -81,6 +81,7 @@ class Sizes(NamedTuple):
     """What a layout has to know of a converted scene."""
 
     shapes: Shapes
+    dtypes: dict[str, np.dtype]
     largest: dict[str, int]  # the largest value of some arrays
 
 
@@ -88,6 +89,7 @@ def sizes_of(converted: Mapping[str, np.ndarray]) -> Sizes:
     """The sizes of one scene's arrays."""
     return Sizes(
         shapes={name: array.shape for name, array in converted.items()},
+        dtypes={name: array.dtype for name, array in converted.items()},
         largest={
             name: int(converted[name].max(initial=0))
             for name in (*NARROWED, COUNTED[1])
@@ -107,9 +109,9 @@ class Spec(NamedTuple):
 class Layout:
     """Types and shapes of the arrays of a bank whose scenes are told of by `add`."""
 
-    def __init__(self, dtypes: Mapping[str, np.dtype]) -> None:
-        """`dtypes` are those of a converted scene, the same for all."""
-        self._dtypes = dict(dtypes)
+    def __init__(self) -> None:
+        """No scene yet."""
+        self._dtypes: dict[str, np.dtype] = {}
         self._scenes = 0
         self._widest: Shapes = {}
         self._rows = dict.fromkeys(TABLES, 0)
@@ -118,6 +120,7 @@ class Layout:
     def add(self, sizes: Sizes) -> None:
         """One more scene, with arrays of these sizes."""
         self._scenes += 1
+        self._dtypes |= sizes.dtypes  # the same for all scenes
         for name, shape in sizes.shapes.items():
             ours = shape[1:] if name in TABLES else shape
             known = self._widest.get(name, ours)

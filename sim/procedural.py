@@ -68,9 +68,9 @@ class Objects:
         )
 
 
-def generate(seed: int) -> Scene:
-    """Scene 0 of this seed."""
-    return _scene(seed, 0)
+def generate(seed: int, index: int = 0) -> Scene:
+    """One scene of this seed."""
+    return _scene(seed, index)
 
 
 def generate_many(seed: int, count: int) -> Iterator[Scene]:

@@ -74,11 +74,60 @@ def read_records(path: Path) -> Iterator[Record | SceneError]:
         yield SceneError(f"{path}: cannot be read ({error.strerror})")
 
 
-def _frames(path: Path, file: BinaryIO) -> Iterator[Record | SceneError]:
-    """Walks the frames of an open file."""
+def record_offsets(path: Path) -> Iterator[int | SceneError]:
+    """Yields where each frame starts, of which only the lengths are read.
+
+    An error ends it, as in `read_records`; payloads' checksums are not looked at.
+    """
+    try:
+        with path.open("rb") as file:
+            for head in _heads(path, file):
+                yield head if isinstance(head, SceneError) else head[0]
+    except OSError as error:
+        yield SceneError(f"{path}: cannot be read ({error.strerror})")
+
+
+def read_record(path: Path, offset: int) -> Record:
+    """The frame that starts at `offset`; raises `SceneError` if it is damaged."""
+    try:
+        with path.open("rb") as file:
+            record = next(_frames(path, file, offset), None)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read ({error.strerror})") from error
+    if record is None:
+        raise SceneError(f"{path}: no record at byte {offset}; did the file change?")
+    if isinstance(record, SceneError):
+        raise record
+    return record
+
+
+def _frames(
+    path: Path, file: BinaryIO, offset: int = 0
+) -> Iterator[Record | SceneError]:
+    """Reads the frames of an open file from `offset` on."""
+    for head in _heads(path, file, offset):
+        if isinstance(head, SceneError):
+            yield head
+            return
+        start, length = head
+        body = file.read(length + _FOOTER_BYTES)
+        if len(body) < length + _FOOTER_BYTES:
+            needed = HEADER_BYTES + length + _FOOTER_BYTES
+            yield _truncated(path, start, needed, start + HEADER_BYTES + len(body))
+            return
+        yield _checked(path, start, body)
+
+
+def _heads(
+    path: Path, file: BinaryIO, offset: int = 0
+) -> Iterator[tuple[int, int] | SceneError]:
+    """Walks the frames: where each starts and how long its payload is.
+
+    While one is looked at the file stands at its payload.
+    """
     size = os.fstat(file.fileno()).st_size
-    offset = 0
     while offset < size:
+        file.seek(offset)
         head = file.read(HEADER_BYTES)
         if len(head) < HEADER_BYTES:
             yield _truncated(path, offset, HEADER_BYTES, size)
@@ -96,11 +145,7 @@ def _frames(path: Path, file: BinaryIO) -> Iterator[Record | SceneError]:
         if end > size:
             yield _truncated(path, offset, end - offset, size)
             return
-        body = file.read(length + _FOOTER_BYTES)
-        if len(body) < length + _FOOTER_BYTES:
-            yield _truncated(path, offset, end - offset, offset + len(body))
-            return
-        yield _checked(path, offset, body)
+        yield offset, length
         offset = end
 
 
