@@ -51,7 +51,7 @@ class Outcome(NamedTuple):
     """What became of a place."""
 
     result: Part | SceneError
-    found: bool  # whether an earlier conversion had done it
+    found: bool  # whether an earlier conversion had got it
 
 
 def work_folder(path: Path) -> Path:
