@@ -1,31 +1,33 @@
 """The policy network in plain JAX: the actors' twin of `learner.network`.
 
-Per observation, with D the width, Q the latents, T the tokens
-(1 ego + neighbours + road rows + lights):
+Per observation, with D the width, Q the latents, T the tokens:
 
-    tokens  = LayerNorm(relu(W_m x_m + b_m) + e_m)      per modality m      [T, D]
+    tokens  = relu(W_m x_m + b_m) + e_m [+ p_m]         per modality m      [T, D]
+    tokens  = blocks of self-attention and feed-forward `token_layers` times
+    tokens  = LayerNorm(tokens)
     latents = learned + W_e ego + b_e                                       [Q, D]
     cross   : latents += attend(LayerNorm(latents), tokens, mask)
               latents += feedforward(LayerNorm(latents))    `cross_layers` times
     self    : the same, latents attending over latents      `self_layers` times
     x       = W LayerNorm(mean of latents) + b                              [mlp_width]
     x      += W relu(LayerNorm(x)) + b                      `mlp_layers` times
-    Q-values = W LayerNorm(x) + b                                           [actions]
+    Q-values = A = W LayerNorm(x) + b                                       [actions]
+    dueling : V + A - mean(A)       (Wang et al., 2016, eq. 9), V another linear of x
 
-The encoder is Wayformer's early fusion with latent queries (Nayakanti et al., 2022:
-projection by relu, pre-normalisation, padding masked), the trunk the 4-layer residual
-MLP that the Waymax paper puts on it. The feed-forward is GELU in its tanh form. Tokens
-are a set: no slot has an embedding of its own.
+This is Wayformer's scene encoder (Nayakanti et al., 2022, section 3: projection by
+relu, learned positional embeddings that start at zero, pre-normalisation, padding
+masked) with the 4-layer residual MLP that the Waymax paper puts on it. The feed-forward
+is GELU in its tanh form. `actors.network_tokens` says what the tokens are and where the
+modalities meet; `actors.network_blocks` has the attention.
+
+Latent queries always read the tokens, also where self-attention came before: they
+are Wayformer's first encoder block with latent queries (its section 3.2) when
+`token_layers` is 0, and stand for the cross-attention of its decoder when not.
 
 Departures from Wayformer: the ego state is also added to the latents, so that the
-residual path carries it; tokens are normalised once, not once per layer; the readout
-is the mean of the latents.
-
-Cross-attention is multi-head attention in another order of multiplication. A head's
-scores are (W_q l) . (W_k t) = (W_k^T W_q l) . t, and its output is
-W_v (sum_t a_t t) + b_v because the weights a_t sum to 1: keys and values of the many
-tokens are never formed, only the few queries are multiplied. A key bias would add the
-same number to all scores of a query, so there is none.
+residual path carries it; tokens are normalised once for all cross layers; the readout
+is the mean of the latents, over all times; an embedding e_m of each modality stands
+beside the positional ones, which are off in the preset `quick` (a set has no order).
 
 Weights are one float32 vector in the order of `parameter_layout`, which is the torch
 module's `state_dict` order; `unpack` cuts it by static slices inside jit.
@@ -35,21 +37,32 @@ import hashlib
 import itertools
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from actors.network_blocks import (
+    Weights,
+    apply_linear,
+    apply_norm,
+    broadcast_rows,
+    cross_block,
+    latent_block,
+)
+from actors.network_tokens import (
+    MODALITIES,
+    encode_tokens,
+    grid_shapes,
+    make_grids,
+    token_features,
+)
 from sim.observation import Observation, ObservationSizes
 
 Layout = tuple[tuple[str, tuple[int, ...]], ...]
-Weights = Mapping[str, Float[Array, "..."]]
-
-NORM_EPSILON = 1e-5
-MASKED = -1e9  # a score so low that its weight is exactly 0; finite, or 0 * inf is NaN
-MODALITIES = ("ego", "agents", "road", "lights")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +76,7 @@ class NetworkConfig:
     """Attention heads; they divide `width`."""
 
     latents: int = 4
-    """Learned queries (Q) that read the tokens."""
+    """Learned queries (Q) that read the tokens; with late fusion, of each modality."""
 
     cross_layers: int = 1
     """Layers in which the latents attend over the tokens, at least 1."""
@@ -80,64 +93,153 @@ class NetworkConfig:
     mlp_layers: int = 4
     """Residual layers of that MLP."""
 
+    fusion: Literal["early", "late", "hierarchical"] = "early"
+    """Where modalities meet: before the tokens' self-attention (early), between it and
+    the latent queries (hierarchical), or after them, in the readout (late)."""
+
+    attention: Literal["multi-axis", "sequential", "interleaved"] = "multi-axis"
+    """Self-attention of tokens: over all at once, or over time and space by turns, the
+    time layers first (sequential) or alternating (interleaved)."""
+
+    token_layers: int = 0
+    """Layers of self-attention among tokens, before the latents read them."""
+
+    time_axis: bool = False
+    """One token for each state of an object, not one with its states side by side."""
+
+    positions: bool = False
+    """A learned embedding for each position of each modality, zero at first."""
+
+    dueling: bool = False
+    """Q-values as a state's value plus the actions' advantages."""
+
     def __post_init__(self) -> None:
         """Refuses sizes that make no network."""
         for name in ("width", "heads", "latents", "cross_layers", "feedforward"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
-        if self.self_layers < 0 or self.mlp_layers < 0 or self.mlp_width < 1:
+        if min(self.self_layers, self.mlp_layers, self.token_layers) < 0 or (
+            self.mlp_width < 1
+        ):
             raise ValueError(
-                f"self_layers={self.self_layers} and mlp_layers={self.mlp_layers} "
-                f"must be at least 0, mlp_width={self.mlp_width} at least 1"
+                f"self_layers={self.self_layers}, mlp_layers={self.mlp_layers} and "
+                f"token_layers={self.token_layers} must be at least 0, "
+                f"mlp_width={self.mlp_width} at least 1"
             )
         if self.width % self.heads:
             raise ValueError(
                 f"heads={self.heads} must divide width={self.width}: "
                 "choose a multiple of heads as width"
             )
+        self._check_attention()
+
+    def _check_attention(self) -> None:
+        if self.fusion == "hierarchical" and self.token_layers == 0:
+            raise ValueError(
+                "fusion=hierarchical with token_layers=0 is early fusion: "
+                "give the modalities layers of their own"
+            )
+        if self.attention == "multi-axis":
+            return
+        if not self.time_axis or self.token_layers < 2 or self.token_layers % 2:
+            raise ValueError(
+                f"attention={self.attention} goes over time and space by turns: it "
+                f"needs time_axis and an even token_layers, not {self.token_layers}"
+            )
+
+    @property
+    def readers(self) -> int:
+        """Sets of latents: one, or with late fusion one of each modality."""
+        return len(MODALITIES) if self.fusion == "late" else 1
+
+    @property
+    def token_encoders(self) -> int:
+        """Stacks of token layers: one, or one of each modality."""
+        return 1 if self.fusion == "early" else len(MODALITIES)
+
+
+def quick_network() -> NetworkConfig:
+    """Minutes on two cores: 4 latent queries read the tokens once."""
+    return NetworkConfig()
+
+
+def laptop_network() -> NetworkConfig:
+    """An hour on two cores: one layer among 8 latents more, positions, wider layers."""
+    return NetworkConfig(width=96, latents=8, self_layers=1, positions=True)
+
+
+def paper_network() -> NetworkConfig:
+    """Wayformer's largest depth of 4 at the Waymax paper's width of 128.
+
+    Early fusion with latent queries: 1 layer reads the tokens, 3 go on among 32
+    latents, a quarter of the paper preset's 119 tokens (Wayformer, section 4.2).
+    """
+    return NetworkConfig(
+        width=128,
+        latents=32,
+        self_layers=3,
+        feedforward=4,
+        time_axis=True,
+        positions=True,
+    )
 
 
 def parameter_layout(
     config: NetworkConfig, sizes: ObservationSizes, actions: int
 ) -> Layout:
     """Names and shapes of all parameters, in torch's `state_dict` order."""
+    return tuple(itertools.chain(_encoder(config, sizes), _trunk(config, actions)))
+
+
+def _encoder(
+    config: NetworkConfig, sizes: ObservationSizes
+) -> Iterator[tuple[str, tuple[int, ...]]]:
+    width, time_axis = config.width, config.time_axis
+    yield "modality", (len(MODALITIES), width)
+    yield "latents", (config.readers * config.latents, width)
+    if config.positions:
+        shapes = grid_shapes(sizes, time_axis=time_axis)
+        yield "positions", (sum(times * slots for times, slots in shapes), width)
+    features = token_features(sizes, time_axis=time_axis)
+    for name, size in zip(MODALITIES, features, strict=True):
+        yield from _linear(f"project.{name}", size, width)
+    yield from _linear("ego_to_latents", sizes.ego, width)
+    among = _linear("query_key_value", width, 3 * width)
+    for index in range(config.token_encoders * config.token_layers):
+        yield from _attention_block(f"tokens.{index}", among, config)
+    yield from _norm("token_norm", width)
+    over = _linear("query", width, width) + _linear("key", width, width)[:1]
+    over += _linear("value", width, width)
+    for index in range(config.readers * config.cross_layers):
+        yield from _attention_block(f"cross.{index}", over, config)
+    for index in range(config.readers * config.self_layers):
+        yield from _attention_block(f"latent.{index}", among, config)
+
+
+def _attention_block(
+    prefix: str, projections: Layout, config: NetworkConfig
+) -> Iterator[tuple[str, tuple[int, ...]]]:
     width, hidden = config.width, config.width * config.feedforward
-    features = (sizes.ego, sizes.agent, sizes.road, sizes.light)
+    yield from _norm(f"{prefix}.query_norm", width)
+    yield from ((f"{prefix}.{name}", shape) for name, shape in projections)
+    yield from _linear(f"{prefix}.out", width, width)
+    yield from _norm(f"{prefix}.feedforward_norm", width)
+    yield from _linear(f"{prefix}.expand", width, hidden)
+    yield from _linear(f"{prefix}.contract", hidden, width)
 
-    def attention_block(prefix: str, projections: Layout) -> Iterator[Layout]:
-        yield _norm(f"{prefix}.query_norm", width)
-        yield tuple((f"{prefix}.{name}", shape) for name, shape in projections)
-        yield _linear(f"{prefix}.out", width, width)
-        yield _norm(f"{prefix}.feedforward_norm", width)
-        yield _linear(f"{prefix}.expand", width, hidden)
-        yield _linear(f"{prefix}.contract", hidden, width)
 
-    def parts() -> Iterator[Layout]:
-        yield (
-            ("modality", (len(MODALITIES), width)),
-            ("latents", (config.latents, width)),
-        )
-        for name, size in zip(MODALITIES, features, strict=True):
-            yield _linear(f"project.{name}", size, width)
-        yield _linear("ego_to_latents", sizes.ego, width)
-        yield _norm("token_norm", width)
-        cross = _linear("query", width, width) + _linear("key", width, width)[:1]
-        cross += _linear("value", width, width)
-        for index in range(config.cross_layers):
-            yield from attention_block(f"cross.{index}", cross)
-        for index in range(config.self_layers):
-            yield from attention_block(
-                f"latent.{index}", _linear("query_key_value", width, 3 * width)
-            )
-        yield _norm("pooled_norm", width)
-        yield _linear("mlp_in", width, config.mlp_width)
-        for index in range(config.mlp_layers):
-            yield _norm(f"mlp.{index}.norm", config.mlp_width)
-            yield _linear(f"mlp.{index}.linear", config.mlp_width, config.mlp_width)
-        yield _norm("head_norm", config.mlp_width)
-        yield _linear("head", config.mlp_width, actions)
-
-    return tuple(itertools.chain.from_iterable(parts()))
+def _trunk(
+    config: NetworkConfig, actions: int
+) -> Iterator[tuple[str, tuple[int, ...]]]:
+    yield from _norm("pooled_norm", config.width)
+    yield from _linear("mlp_in", config.width, config.mlp_width)
+    for index in range(config.mlp_layers):
+        yield from _norm(f"mlp.{index}.norm", config.mlp_width)
+        yield from _linear(f"mlp.{index}.linear", config.mlp_width, config.mlp_width)
+    yield from _norm("head_norm", config.mlp_width)
+    yield from _linear("head", config.mlp_width, actions)
+    if config.dueling:
+        yield from _linear("value", config.mlp_width, 1)
 
 
 def layout_hash(layout: Layout) -> str:
@@ -181,28 +283,18 @@ def q_values(
     `in_axes` is None for the vector: the weights are shared by the batch.
     """
     weights = unpack(vector, parameter_layout(config, sizes, actions))
-    tokens, valid = _tokens(weights, observation)
-    latents = weights["latents"] + _broadcast_rows(
-        _apply_linear(weights, "ego_to_latents", observation.ego), config.latents
-    )
-    for index in range(config.cross_layers):
-        prefix = f"cross.{index}"
-        query = _apply_norm(weights, f"{prefix}.query_norm", latents)
-        latents += _cross_attention(
-            weights, prefix, query, tokens, valid, heads=config.heads
-        )
-        latents += _feedforward(weights, prefix, latents)
-    for index in range(config.self_layers):
-        prefix = f"latent.{index}"
-        query = _apply_norm(weights, f"{prefix}.query_norm", latents)
-        latents += _self_attention(weights, prefix, query, heads=config.heads)
-        latents += _feedforward(weights, prefix, latents)
-    pooled = _apply_norm(weights, "pooled_norm", latents.mean(axis=0))
-    x = _apply_linear(weights, "mlp_in", pooled)
+    latents = _read(weights, observation, config, sizes)
+    pooled = apply_norm(weights, "pooled_norm", latents.mean(axis=0))
+    x = apply_linear(weights, "mlp_in", pooled)
     for index in range(config.mlp_layers):
-        hidden = jax.nn.relu(_apply_norm(weights, f"mlp.{index}.norm", x))
-        x += _apply_linear(weights, f"mlp.{index}.linear", hidden)
-    return _apply_linear(weights, "head", _apply_norm(weights, "head_norm", x))
+        hidden = jax.nn.relu(apply_norm(weights, f"mlp.{index}.norm", x))
+        x += apply_linear(weights, f"mlp.{index}.linear", hidden)
+    x = apply_norm(weights, "head_norm", x)
+    values = apply_linear(weights, "head", x)
+    if config.dueling:
+        above = apply_linear(weights, "value", x) - values.mean(keepdims=True)
+        values += jnp.broadcast_to(above, values.shape)
+    return values
 
 
 def batched(
@@ -223,106 +315,49 @@ def batched(
     return jax.vmap(one)(observations)
 
 
+def _read(
+    weights: Weights,
+    observation: Observation,
+    config: NetworkConfig,
+    sizes: ObservationSizes,
+) -> Float[Array, "latents width"]:
+    """What all latents hold in the end."""
+    grids = make_grids(weights, observation, sizes, time_axis=config.time_axis)
+    groups = encode_tokens(
+        weights,
+        grids,
+        fusion=config.fusion,
+        attention=config.attention,
+        layers=config.token_layers,
+        heads=config.heads,
+    )
+    ego = apply_linear(weights, "ego_to_latents", observation.ego)
+    read = []
+    for reader, (tokens, valid) in enumerate(groups):
+        first = reader * config.latents
+        latents = weights["latents"][first : first + config.latents]
+        latents += broadcast_rows(ego, config.latents)
+        for index in range(config.cross_layers):
+            prefix = f"cross.{reader * config.cross_layers + index}"
+            latents = cross_block(
+                weights,
+                prefix,
+                latents,
+                tokens,
+                valid,
+                heads=config.heads,
+                may_be_empty=config.readers > 1,
+            )
+        for index in range(config.self_layers):
+            prefix = f"latent.{reader * config.self_layers + index}"
+            latents = latent_block(weights, prefix, latents, heads=config.heads)
+        read.append(latents)
+    return jnp.concatenate(read)
+
+
 def _linear(name: str, inputs: int, outputs: int) -> Layout:
     return ((f"{name}.weight", (outputs, inputs)), (f"{name}.bias", (outputs,)))
 
 
 def _norm(name: str, size: int) -> Layout:
     return ((f"{name}.weight", (size,)), (f"{name}.bias", (size,)))
-
-
-def _broadcast_rows(
-    row: Float[Array, " features"], rows: int
-) -> Float[Array, "rows features"]:
-    return jnp.broadcast_to(row[None, :], (rows, row.shape[0]))
-
-
-def _apply_linear(
-    weights: Weights, name: str, x: Float[Array, "*rows inputs"]
-) -> Float[Array, "*rows outputs"]:
-    y = x @ weights[f"{name}.weight"].T
-    return y + jnp.broadcast_to(weights[f"{name}.bias"], y.shape)
-
-
-def _apply_norm(
-    weights: Weights, name: str, x: Float[Array, "*rows features"]
-) -> Float[Array, "*rows features"]:
-    centred = x - x.mean(axis=-1, keepdims=True)
-    variance = jnp.square(centred).mean(axis=-1, keepdims=True)
-    scale = jnp.broadcast_to(weights[f"{name}.weight"], x.shape)
-    shift = jnp.broadcast_to(weights[f"{name}.bias"], x.shape)
-    return centred * jax.lax.rsqrt(variance + NORM_EPSILON) * scale + shift
-
-
-def _tokens(
-    weights: Weights, observation: Observation
-) -> tuple[Float[Array, "tokens width"], Bool[Array, " tokens"]]:
-    rows = {
-        "ego": observation.ego[None, :],
-        "agents": observation.agents,
-        "road": observation.road,
-        "lights": observation.lights,
-    }
-    parts = [
-        jax.nn.relu(_apply_linear(weights, f"project.{name}", features))
-        + _broadcast_rows(weights["modality"][index], features.shape[0])
-        for index, (name, features) in enumerate(rows.items())
-    ]
-    valid = jnp.concatenate(
-        [
-            jnp.ones(1, jnp.bool_),
-            observation.agents_valid,
-            observation.road_valid,
-            observation.lights_valid,
-        ]
-    )
-    return _apply_norm(weights, "token_norm", jnp.concatenate(parts)), valid
-
-
-def _cross_attention(
-    weights: Weights,
-    prefix: str,
-    query: Float[Array, "latents width"],
-    tokens: Float[Array, "tokens width"],
-    valid: Bool[Array, " tokens"],
-    *,
-    heads: int,
-) -> Float[Array, "latents width"]:
-    latents, width = query.shape
-    split = width // heads
-    q = _apply_linear(weights, f"{prefix}.query", query)
-    q = q.reshape(latents, heads, split) * (split**-0.5)
-    key = weights[f"{prefix}.key.weight"].reshape(heads, split, width)
-    value = weights[f"{prefix}.value.weight"].reshape(heads, split, width)
-    q = jnp.einsum("qhs,hsd->hqd", q, key).reshape(heads * latents, width)
-    scores = q @ tokens.T
-    masked = jnp.where(jnp.broadcast_to(valid, scores.shape), scores, MASKED)
-    pooled = (jax.nn.softmax(masked, axis=-1) @ tokens).reshape(heads, latents, width)
-    y = jnp.einsum("hqd,hsd->qhs", pooled, value).reshape(latents, width)
-    y += jnp.broadcast_to(weights[f"{prefix}.value.bias"], y.shape)
-    return _apply_linear(weights, f"{prefix}.out", y)
-
-
-def _self_attention(
-    weights: Weights,
-    prefix: str,
-    query: Float[Array, "latents width"],
-    *,
-    heads: int,
-) -> Float[Array, "latents width"]:
-    latents, width = query.shape
-    split = width // heads
-    qkv = _apply_linear(weights, f"{prefix}.query_key_value", query)
-    q, k, v = qkv.reshape(latents, 3, heads, split).transpose(1, 2, 0, 3)
-    scores = jnp.einsum("hqs,hks->hqk", q, k) * (split**-0.5)
-    y = jnp.einsum("hqk,hks->qhs", jax.nn.softmax(scores, axis=-1), v)
-    return _apply_linear(weights, f"{prefix}.out", y.reshape(latents, width))
-
-
-def _feedforward(
-    weights: Weights, prefix: str, x: Float[Array, "rows width"]
-) -> Float[Array, "rows width"]:
-    hidden = _apply_norm(weights, f"{prefix}.feedforward_norm", x)
-    hidden = _apply_linear(weights, f"{prefix}.expand", hidden)
-    hidden = jax.nn.gelu(hidden, approximate=True)
-    return _apply_linear(weights, f"{prefix}.contract", hidden)

@@ -3,12 +3,13 @@
 import json
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -85,6 +86,7 @@ _UNREADABLE = (
     NotImplementedError,
     zipfile.BadZipFile,
     zlib.error,
+    msgspec.ValidationError,
 )
 
 
@@ -96,7 +98,7 @@ def read_policy(path: Path) -> Policy:
             named = str(arrays["layout_hash"])
             policy = Policy(
                 vector=_weights(arrays["vector"]),
-                network=NetworkConfig(**_whole_numbers(arrays["network"])),
+                network=_network(arrays["network"]),
                 sizes=ObservationSizes(**_whole_numbers(arrays["sizes"])),
                 actions=int(arrays["actions"]),
                 extra=json.loads(str(arrays["extra"])),
@@ -123,6 +125,15 @@ def _weights(vector: np.ndarray) -> np.ndarray:
     if vector.ndim != 1 or vector.dtype != np.float32:
         raise ValueError(f"weights are {vector.dtype} of shape {vector.shape}")
     return vector
+
+
+def _network(text: np.ndarray) -> NetworkConfig:
+    """The network's sizes; fields that an older version lacked have their defaults."""
+    values = json.loads(str(text))
+    unknown = values.keys() - {field.name for field in fields(NetworkConfig)}
+    if unknown:
+        raise ValueError(f"unknown {', '.join(sorted(unknown))}")
+    return msgspec.convert(values, NetworkConfig)
 
 
 def _whole_numbers(text: np.ndarray) -> dict[str, int]:

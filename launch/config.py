@@ -23,7 +23,7 @@ from typing import Any, Final
 import msgspec
 
 from actors.actor import ActorConfig
-from actors.network import NetworkConfig
+from actors.network import NetworkConfig, paper_network, quick_network
 from launch.errors import LaunchError
 from learner.config import LearnerConfig
 from replay.local import ReplayConfig
@@ -127,7 +127,7 @@ def quick() -> ExperimentConfig:
             progress=0.03,
             terminate=True,
         ),
-        network=NetworkConfig(),
+        network=quick_network(),
         actor=ActorConfig(environments=16, scan_steps=8),
         replay=ReplayConfig(capacity=200_000, min_size=2_000, samples_per_insert=4.0),
         learner=LearnerConfig(
@@ -145,11 +145,7 @@ def quick() -> ExperimentConfig:
 
 def paper() -> ExperimentConfig:
     """The paper's DQN; it gives the width of 128, the other sizes are ours."""
-    return ExperimentConfig(
-        network=NetworkConfig(
-            width=128, latents=16, cross_layers=2, self_layers=2, feedforward=4
-        )
-    )
+    return ExperimentConfig(network=paper_network())
 
 
 PRESETS: Final = {"quick": quick, "paper": paper}

@@ -11,111 +11,18 @@ from typing import final
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from actors.network import MASKED, MODALITIES, NORM_EPSILON, Layout, NetworkConfig
+from actors.network import Layout, NetworkConfig
+from actors.network_blocks import NORM_EPSILON
+from actors.network_tokens import MODALITIES, grid_shapes, time_steps, token_features
+from learner.network_blocks import CrossBlock, LatentBlock, ResidualLayer, mask_bias
+from learner.network_tokens import Grid, Inputs, encode_tokens, split_over_time
 from sim.observation import Observation, ObservationSizes
 
 # What JAX rendered is read-only memory, and nothing here writes into observations.
 warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
-
-
-@final
-class CrossBlock(nn.Module):
-    """Latents attend over tokens, then feed forward; both pre-norm and residual."""
-
-    def __init__(self, config: NetworkConfig) -> None:
-        """Creates uninitialised layers."""
-        nn.Module.__init__(self)
-        width = config.width
-        self.heads = config.heads
-        self.query_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
-        self.query = nn.Linear(width, width)
-        self.key = nn.Linear(width, width, bias=False)
-        self.value = nn.Linear(width, width)
-        self.out = nn.Linear(width, width)
-        self.feedforward_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
-        self.expand = nn.Linear(width, width * config.feedforward)
-        self.contract = nn.Linear(width * config.feedforward, width)
-
-    def forward(
-        self,
-        latents: Float[Tensor, "batch latents width"],
-        tokens: Float[Tensor, "batch tokens width"],
-        bias: Float[Tensor, "batch 1 tokens"],
-    ) -> Float[Tensor, "batch latents width"]:
-        """Adds what the latents read; `bias` is 0 or `MASKED`."""
-        batch, count, width = latents.shape
-        heads, split = self.heads, width // self.heads
-        rows = batch * count
-        # Keys and values of the tokens are never formed (see `actors.network`):
-        # measured 2.0 to 2.3 times faster forward and backward than forming them
-        # for 4 latents over 49 tokens, 1.4 times for 8.
-        q = self.query(self.query_norm(latents)).view(rows, heads, split)
-        # The scale goes on the small weight: on the scores, its gradient would be
-        # multiplied at the size of all tokens.
-        key = self.key.weight.view(heads, split, width) * split**-0.5
-        q = torch.bmm(q.transpose(0, 1), key)
-        q = q.view(heads, batch, count, width).transpose(0, 1)
-        q = q.reshape(batch, heads * count, width)
-        scores = torch.baddbmm(bias, q, tokens.transpose(1, 2))
-        pooled = torch.bmm(scores.softmax(-1), tokens)
-        pooled = pooled.view(batch, heads, count, width).transpose(0, 1)
-        y = torch.baddbmm(
-            self.value.bias.view(heads, 1, split),
-            pooled.reshape(heads, rows, width),
-            self.value.weight.view(heads, split, width).transpose(1, 2),
-        )
-        latents = latents + self.out(y.transpose(0, 1).reshape(batch, count, width))
-        return latents + _feedforward(self, latents)
-
-
-@final
-class LatentBlock(nn.Module):
-    """Latents attend over each other, then feed forward; pre-norm and residual."""
-
-    def __init__(self, config: NetworkConfig) -> None:
-        """Creates uninitialised layers."""
-        nn.Module.__init__(self)
-        width = config.width
-        self.heads = config.heads
-        self.query_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
-        self.query_key_value = nn.Linear(width, 3 * width)
-        self.out = nn.Linear(width, width)
-        self.feedforward_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
-        self.expand = nn.Linear(width, width * config.feedforward)
-        self.contract = nn.Linear(width * config.feedforward, width)
-
-    def forward(
-        self, latents: Float[Tensor, "batch latents width"]
-    ) -> Float[Tensor, "batch latents width"]:
-        """Adds what the latents tell each other."""
-        batch, count, width = latents.shape
-        qkv = self.query_key_value(self.query_norm(latents))
-        qkv = qkv.view(batch, count, 3, self.heads, width // self.heads)
-        q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)
-        y = F.scaled_dot_product_attention(q, k, v)
-        y = y.transpose(1, 2).reshape(batch, count, width)
-        latents = latents + self.out(y)
-        return latents + _feedforward(self, latents)
-
-
-@final
-class ResidualLayer(nn.Module):
-    """x + linear(relu(norm(x)))."""
-
-    def __init__(self, width: int) -> None:
-        """Creates uninitialised layers."""
-        nn.Module.__init__(self)
-        self.norm = nn.LayerNorm(width, eps=NORM_EPSILON)
-        self.linear = nn.Linear(width, width)
-
-    def forward(self, x: Float[Tensor, "batch width"]) -> Float[Tensor, "batch width"]:
-        """Adds the layer's change to x."""
-        y: Tensor = x + self.linear(self.norm(x).relu())
-        return y
 
 
 @final
@@ -132,10 +39,15 @@ class QNetwork(nn.Module):
     ) -> None:
         """Creates and initialises the network."""
         nn.Module.__init__(self)
-        width = config.width
+        width, time_axis = config.width, config.time_axis
+        self.config = config
+        self.times = time_steps(sizes, time_axis=time_axis)
         self.modality = nn.Parameter(torch.empty(len(MODALITIES), width))
-        self.latents = nn.Parameter(torch.empty(config.latents, width))
-        features = (sizes.ego, sizes.agent, sizes.road, sizes.light)
+        self.latents = nn.Parameter(torch.empty(config.readers * config.latents, width))
+        self.counts = [t * s for t, s in grid_shapes(sizes, time_axis=time_axis)]
+        if config.positions:
+            self.positions = nn.Parameter(torch.zeros(sum(self.counts), width))
+        features = token_features(sizes, time_axis=time_axis)
         self.project = nn.ModuleDict(
             {
                 name: nn.Linear(size, width)
@@ -143,12 +55,16 @@ class QNetwork(nn.Module):
             }
         )
         self.ego_to_latents = nn.Linear(sizes.ego, width)
+        self.tokens = nn.ModuleList(
+            LatentBlock(config)
+            for _ in range(config.token_encoders * config.token_layers)
+        )
         self.token_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
         self.cross = nn.ModuleList(
-            CrossBlock(config) for _ in range(config.cross_layers)
+            CrossBlock(config) for _ in range(config.readers * config.cross_layers)
         )
         self.latent = nn.ModuleList(
-            LatentBlock(config) for _ in range(config.self_layers)
+            LatentBlock(config) for _ in range(config.readers * config.self_layers)
         )
         self.pooled_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
         self.mlp_in = nn.Linear(width, config.mlp_width)
@@ -157,6 +73,8 @@ class QNetwork(nn.Module):
         )
         self.head_norm = nn.LayerNorm(config.mlp_width, eps=NORM_EPSILON)
         self.head = nn.Linear(config.mlp_width, actions)
+        if config.dueling:
+            self.value = nn.Linear(config.mlp_width, 1)
         _initialise(self, generator)
 
     def forward(
@@ -170,26 +88,66 @@ class QNetwork(nn.Module):
         lights_valid: Bool[Tensor, "batch lights"],
     ) -> Float[Tensor, "batch actions"]:
         """Takes the fields of `Observation` in their order."""
-        rows = (ego[:, None, :], agents, road, lights)
-        tokens = torch.cat(
-            [
-                self.project[name](x).relu() + self.modality[index]
-                for index, (name, x) in enumerate(zip(MODALITIES, rows, strict=True))
-            ],
-            dim=1,
+        if self.config.time_axis:
+            objects = split_over_time(ego, agents, agents_valid, self.times)
+        else:
+            here = agents_valid.new_ones(agents_valid.shape[0], 1, 1)
+            objects = (
+                Inputs(ego[:, None, None], here),
+                Inputs(agents[:, None], agents_valid[:, None]),
+            )
+        grids = self._grids(
+            *objects,
+            Inputs(road[:, None], road_valid[:, None]),
+            Inputs(lights[:, None], lights_valid[:, None]),
         )
-        tokens = self.token_norm(tokens)
-        bias = _mask_bias(agents_valid, road_valid, lights_valid)
-        latents = self.latents + self.ego_to_latents(ego)[:, None, :]
-        for cross in self.cross:
-            latents = cross(latents, tokens, bias)
-        for block in self.latent:
-            latents = block(latents)
+        latents = self._read(grids, ego)
         x = self.mlp_in(self.pooled_norm(latents.mean(dim=1)))
         for layer in self.mlp:
             x = layer(x)
-        values: Tensor = self.head(self.head_norm(x))
+        x = self.head_norm(x)
+        values: Tensor = self.head(x)
+        if self.config.dueling:
+            values = values + self.value(x) - values.mean(-1, keepdim=True)
         return values
+
+    def _grids(self, *modalities: Inputs) -> list[Grid]:
+        """Projects the features, and adds the embeddings."""
+        grids, first = [], 0
+        for index, (name, inputs) in enumerate(
+            zip(MODALITIES, modalities, strict=True)
+        ):
+            embedding = self.modality[index]
+            if self.config.positions:
+                stop = first + self.counts[index]
+                own = self.positions[first:stop] + embedding
+                embedding = own.view(*inputs.features.shape[1:3], -1)
+                first = stop
+            tokens = self.project[name](inputs.features).relu() + embedding
+            grids.append(Grid(tokens, inputs.valid))
+        return grids
+
+    def _read(
+        self, grids: list[Grid], ego: Float[Tensor, "batch ego_features"]
+    ) -> Float[Tensor, "batch latents width"]:
+        """What all latents hold in the end."""
+        config = self.config
+        groups = encode_tokens(grids, self.tokens, self.token_norm, config)
+        own = self.ego_to_latents(ego)[:, None, :]
+        read = []
+        for reader, (tokens, valid) in enumerate(groups):
+            first = reader * config.latents
+            latents = self.latents[first : first + config.latents] + own
+            bias = mask_bias(valid)
+            # One reader always sees the ego.
+            some = valid.any(-1)[:, None, None] if config.readers > 1 else None
+            for index in range(config.cross_layers):
+                block = self.cross[reader * config.cross_layers + index]
+                latents = block(latents, tokens, bias, some)
+            for index in range(config.self_layers):
+                latents = self.latent[reader * config.self_layers + index](latents)
+            read.append(latents)
+        return torch.cat(read, 1) if len(read) > 1 else read[0]
 
 
 def to_torch(observation: Observation, device: torch.device) -> tuple[Tensor, ...]:
@@ -227,26 +185,6 @@ def load_vector(network: nn.Module, vector: Float[np.ndarray, " parameters"]) ->
         for value in values:
             value.copy_(source[start : start + value.numel()].view(value.shape))
             start += value.numel()
-
-
-def _feedforward(
-    block: CrossBlock | LatentBlock, x: Float[Tensor, "batch latents width"]
-) -> Float[Tensor, "batch latents width"]:
-    hidden = block.expand(block.feedforward_norm(x))
-    y: Tensor = block.contract(F.gelu(hidden, approximate="tanh"))
-    return y
-
-
-def _mask_bias(
-    agents_valid: Bool[Tensor, "batch neighbours"],
-    road_valid: Bool[Tensor, "batch rows"],
-    lights_valid: Bool[Tensor, "batch lights"],
-) -> Float[Tensor, "batch 1 tokens"]:
-    ego_valid = agents_valid.new_ones(agents_valid.shape[0], 1)
-    valid = torch.cat([ego_valid, agents_valid, road_valid, lights_valid], dim=1)
-    # MASKED added to a score of unit size is MASKED within rounding, and its
-    # exponential is exactly 0.
-    return (~valid).to(torch.float32).mul_(MASKED)[:, None, :]
 
 
 def _initialise(network: QNetwork, generator: torch.Generator) -> None:

@@ -8,80 +8,23 @@ import torch
 
 from actors.network import (
     NetworkConfig,
-    batched,
     layout_hash,
     parameter_count,
     parameter_layout,
     q_values,
     unpack,
 )
-from learner.network import QNetwork, load_vector, to_torch, to_vector, torch_layout
-from sim.observation import Observation, ObservationSizes
-
-SIZES = ObservationSizes(
-    ego=9, neighbours=5, agent=7, rows=6, road=4, lights=2, light=3
+from learner.network import load_vector, to_torch, to_vector, torch_layout
+from sim.observation import Observation
+from tests.networks import (
+    ACTIONS,
+    CONFIGS,
+    SIZES,
+    make_network,
+    make_observations,
+    run_jax,
+    run_torch,
 )
-ACTIONS = 11
-CONFIGS = {
-    "quick": NetworkConfig(),
-    "deep": NetworkConfig(
-        width=48, heads=3, latents=8, cross_layers=2, self_layers=2, feedforward=4
-    ),
-    "smallest": NetworkConfig(
-        width=4, heads=1, latents=1, feedforward=1, mlp_width=8, mlp_layers=0
-    ),
-}
-
-
-def make_network(config, seed=0, perturb=0.1):
-    generator = torch.Generator().manual_seed(seed)
-    network = QNetwork(config=config, sizes=SIZES, actions=ACTIONS, generator=generator)
-    with torch.no_grad():
-        for value in network.parameters():
-            # Zero biases and unit scales would hide parameters that are swapped.
-            value.add_(torch.randn(value.shape, generator=generator) * perturb)
-    return network
-
-
-def make_observations(batch, *, seed=0, share=0.7):
-    """Random features; each mask is True with probability `share`."""
-    rng = np.random.default_rng(seed)
-
-    def features(*shape):
-        return rng.standard_normal((batch, *shape)).astype(np.float32)
-
-    def mask(count):
-        return rng.random((batch, count)) < share
-
-    return Observation(
-        ego=features(SIZES.ego),
-        agents=features(SIZES.neighbours, SIZES.agent),
-        agents_valid=mask(SIZES.neighbours),
-        road=features(SIZES.rows, SIZES.road),
-        road_valid=mask(SIZES.rows),
-        lights=features(SIZES.lights, SIZES.light),
-        lights_valid=mask(SIZES.lights),
-    )
-
-
-def run_torch(network, observations):
-    with torch.no_grad():
-        return network(*to_torch(observations, torch.device("cpu"))).numpy()
-
-
-run_batch = jax.jit(batched, static_argnames=("config", "sizes", "actions"))
-
-
-def run_jax(vector, observations, config):
-    return np.asarray(
-        run_batch(
-            jnp.asarray(vector),
-            jax.tree.map(jnp.asarray, observations),
-            config=config,
-            sizes=SIZES,
-            actions=ACTIONS,
-        )
-    )
 
 
 @pytest.mark.parametrize("name", CONFIGS)
