@@ -56,7 +56,7 @@ class Bank(NamedTuple):
     path_start: Float[Array, "scenes objects"]  # m, arc length at `current_step`
     path_end: Float[Array, "scenes objects"]  # m, arc length at the log's end
     chunk_start: Int[Array, " scenes"]  # first row of `chunks`
-    chunks: Float[Array, "rows 9 2"]  # m, stretches of lanes; the last point fills up
+    chunks: Float[Array, "rows 2 9"]  # m, x and y of lanes; the last point fills up
     stop_position: Float[Array, "scenes stops 2"]  # m, where lanes pass stop signs
     stops: Int[Array, " scenes"]  # stop positions of the scene
     light_position: Float[Array, "scenes lights 2"]  # m, the stop point

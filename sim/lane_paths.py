@@ -29,7 +29,6 @@ along the first of the on-route samples that a stretch is part of.
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -77,11 +76,10 @@ class Piece(NamedTuple):
     flags: int
 
 
-@dataclass
-class _Run:
+class _Run(NamedTuple):
     """A stretch of the log along the graph, or off all lanes (no lanes)."""
 
-    lanes: list[int]
+    lanes: tuple[int, ...]
     first: int  # pose
     last: int
 
@@ -131,25 +129,24 @@ def _runs(
     for pose, lane in enumerate(lanes.tolist()):
         run = runs[-1] if runs else None
         if run and lane == (run.lanes[-1] if run.lanes else NOWHERE):
-            run.last = pose
+            runs[-1] = run._replace(last=pose)
             continue
         between = None
         if run and run.lanes and lane != NOWHERE:
             limit = SKIP + float(moved[pose - 1])
             between = graph.shortest(run.lanes[-1], lane, limit)
         if run and between is not None:
-            run.lanes += [*between, lane]
-            run.last = pose
+            runs[-1] = _Run((*run.lanes, *between, lane), run.first, pose)
         else:
-            runs.append(_Run([] if lane == NOWHERE else [lane], pose, pose))
+            runs.append(_Run(() if lane == NOWHERE else (lane,), pose, pose))
     return runs
 
 
 class _Chain(NamedTuple):
     """A run's lanes with the arc lengths of their starts."""
 
-    lanes: list[int]
-    offsets: list[float]  # m
+    lanes: tuple[int, ...]
+    offsets: tuple[float, ...]  # m
 
 
 def _chains(
@@ -166,7 +163,7 @@ def _chains(
         if run.lanes:
             start = reached - float(near.arc[run.first, column[run.lanes[0]]])
             lengths = [float(graph.arcs[lane][-1]) for lane in run.lanes]
-            offsets = (start + np.cumsum([0.0, *lengths[:-1]])).tolist()
+            offsets = tuple((start + np.cumsum([0.0, *lengths[:-1]])).tolist())
             reached = offsets[-1] + float(near.arc[run.last, column[run.lanes[-1]]])
             chains.append(_Chain(run.lanes, offsets))
             continue
@@ -188,31 +185,30 @@ def _pieces(
     chains, driven, end = _chains(graph, near, xy, runs)
     limit = max(end + AHEAD, RANGE)
     on: list[Piece] = []
-    forks: list[tuple[int, float]] = []
+    off: dict[int, float] = {}
     for number, (lanes, offsets) in enumerate(chains):
         final = number == len(chains) - 1
         # From the end: a lane with a fork behind it is on off-route paths, too.
         shared = OFF * (not final)
         for index in reversed(range(len(lanes))):
-            last = index == len(lanes) - 1
-            behind = offsets[index] + float(graph.arcs[lanes[index]][-1])
-            leaving = [
-                (lane, behind)
-                for lane in graph.exits[lanes[index]]
-                if last or lane != lanes[index + 1]
-            ]
+            lane, last = lanes[index], index == len(lanes) - 1
+            behind = offsets[index] + float(graph.arcs[lane][-1])
+            reached = graph.reach(
+                [
+                    (following, behind)
+                    for following in graph.exits[lane]
+                    if last or following != lanes[index + 1]
+                ],
+                limit,
+                passed=lanes[: index + 1],
+            )
             if final and last:
-                onward = graph.reach(leaving, limit)
+                on += [Piece(onward, way, ON) for onward, way in reached.items()]
             else:
-                forks += leaving
-                shared |= OFF * bool(leaving)
-            on.append(Piece(lanes[index], offsets[index], ON | shared))
-    on += [
-        Piece(lane, offset, ON)
-        for lane, offset in onward.items()
-        if lane not in chains[-1].lanes
-    ]
-    off = graph.reach(forks, limit)
+                shared |= OFF * bool(reached)
+                for other, way in reached.items():
+                    off[other] = min(way, off.get(other, np.inf))
+            on.append(Piece(lane, offsets[index], ON | shared))
     on_lanes = {piece.line for piece in on}
     pieces = [
         piece._replace(flags=piece.flags | OFF * (piece.line in off)) for piece in on
@@ -254,14 +250,14 @@ def sample_pieces(
         for key in _keys(line):
             flags[key] = flags.get(key, 0) | (ON if path.on_route else OFF)
     pieces: list[Piece] = []
-    done: set[bytes] = set()
+    taken: set[bytes] = set()
     order = sorted(range(len(paths)), key=lambda index: not paths[index].on_route)
     for index in order:
         line, keys = points[index], _keys(points[index])
         arc = arc_lengths(line)
         # A piece ends where the flags change or what is known already begins.
-        marks = [0 if key in done else flags[key] for key in keys]
-        done.update(keys)
+        marks = [0 if key in taken else flags[key] for key in keys]
+        taken.update(keys)
         cuts = [0, *(np.flatnonzero(np.diff(marks)) + 1).tolist(), len(marks)]
         for start, end in itertools.pairwise(cuts):
             if end > start and marks[start]:

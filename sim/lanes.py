@@ -16,7 +16,7 @@ no lane at all (`OFF_COST`).
 
 import dataclasses
 import heapq
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,6 +30,7 @@ JOIN_DISTANCE = 0.1  # m; recorded lanes join within 1 mm
 JOIN_ANGLE = np.deg2rad(45.0)
 LANE_REACH = 3.5  # m: an object farther from a lane's centre is not on it
 LANE_ANGLE = np.deg2rad(45.0)  # nor one that heads elsewhere
+LANE_BEYOND = 1.0  # m: nor one that has left it at its end
 TOLERANCE = 0.01  # m between a lane and what is kept of it
 DISTANCE_SCALE = 1.0  # m, standard deviation of an object's offset
 ANGLE_SCALE = np.deg2rad(20.0)  # standard deviation of its heading
@@ -84,19 +85,22 @@ class LaneGraph:
         return line[index] + part * along, float(_angle(along))
 
     def reach(
-        self, starts: Sequence[tuple[int, float]], limit: float
+        self,
+        starts: Sequence[tuple[int, float]],
+        limit: float,
+        passed: Collection[int] = (),
     ) -> dict[int, float]:
         """The shortest way [m] to the start of every lane within `limit`.
 
-        `starts` are lanes with the way to their starts. Each lane is reached once, so
-        rings end.
+        `starts` are lanes with the way to their starts. Each lane is reached once and
+        those `passed` before not again, so rings end.
         """
         found: dict[int, float] = {}
         heap = [(way, lane) for lane, way in starts]
         heapq.heapify(heap)
         while heap:
             way, lane = heapq.heappop(heap)
-            if lane in found or way > limit:
+            if lane in found or lane in passed or way > limit:
                 continue
             found[lane] = way
             length = float(self.arcs[lane][-1])
@@ -180,16 +184,26 @@ def _named(lanes: Sequence[Polyline]) -> tuple[tuple[int, ...], ...]:
 
 def _joined(lines: Sequence[np.ndarray]) -> tuple[tuple[int, ...], ...]:
     """Successors by where lanes begin and end."""
-    if not lines:
-        return ()
-    starts = np.array([line[0] for line in lines])
-    angle_in = np.array([_angle(line[1] - line[0]) for line in lines])
+    starts = np.array([line[0] for line in lines]).reshape(-1, 2)
+    order = np.argsort(starts[:, 0])
     exits = []
     for index, line in enumerate(lines):
-        near = np.hypot(*(starts - line[-1]).T) < JOIN_DISTANCE
-        near &= turned(angle_in, _angle(line[-1] - line[-2])) < JOIN_ANGLE
-        near[index] = False
-        exits.append(tuple(int(lane) for lane in np.flatnonzero(near)))
+        # By x first: all pairs would be too many where lanes are cut small.
+        bounds = line[-1, 0] + np.array([-JOIN_DISTANCE, JOIN_DISTANCE])
+        near = order[slice(*np.searchsorted(starts[order, 0], bounds))]
+        near = near[np.hypot(*(starts[near] - line[-1]).T) < JOIN_DISTANCE]
+        yaw = _angle(line[-1] - line[-2])
+        exits.append(
+            tuple(
+                sorted(
+                    int(lane)
+                    for lane in near
+                    if lane != index
+                    and turned(_angle(lines[lane][1] - lines[lane][0]), yaw)
+                    < JOIN_ANGLE
+                )
+            )
+        )
     return tuple(exits)
 
 
@@ -211,6 +225,7 @@ class Near(NamedTuple):
     distance: Float[np.ndarray, "poses lines"]  # m
     arc: Float[np.ndarray, "poses lines"]  # m, along the line
     turn: Float[np.ndarray, "poses lines"]  # rad between heading and line, 0 to pi
+    beyond: Float[np.ndarray, "poses lines"]  # m past the line's end, or before it
 
 
 def nearest(
@@ -228,20 +243,29 @@ def nearest(
     squared = np.maximum((along**2).sum(1), 1e-18)
     offset_x = xy[:, :1] - start[:, 0]
     offset_y = xy[:, 1:] - start[:, 1]
-    t = np.clip((offset_x * along[:, 0] + offset_y * along[:, 1]) / squared, 0.0, 1.0)
+    part = (offset_x * along[:, 0] + offset_y * along[:, 1]) / squared
+    t = np.clip(part, 0.0, 1.0)
     apart = np.hypot(offset_x - t * along[:, 0], offset_y - t * along[:, 1])
     lines, first = np.unique(line, return_index=True)
     bounds = [*first.tolist(), len(line)]
     shape = (len(xy), len(lines))
-    distance, where, turn = np.empty(shape), np.empty(shape), np.empty(shape)
+    distance, where, turn, beyond = (np.empty(shape) for _ in range(4))
     every = np.arange(len(xy))
     for column in range(len(lines)):
-        part = slice(bounds[column], bounds[column + 1])
-        best = apart[:, part].argmin(1) + bounds[column]
+        own = slice(bounds[column], bounds[column + 1])
+        best = apart[:, own].argmin(1) + bounds[column]
+        length = np.sqrt(squared[best])
         distance[:, column] = apart[every, best]
-        where[:, column] = arc[best] + t[every, best] * np.sqrt(squared[best])
+        where[:, column] = arc[best] + t[every, best] * length
         turn[:, column] = turned(yaw, _angle(along[best]))
-    return Near(lines, distance, where, turn)
+        beyond[:, column] = np.abs(part - t)[every, best] * length
+    return Near(lines, distance, where, turn, beyond)
+
+
+def on_lane(graph: LaneGraph, near: Near) -> Bool[np.ndarray, "poses lines"]:
+    """Whether an object of a pose may be on a lane."""
+    on = (near.distance <= LANE_REACH) & (near.turn <= LANE_ANGLE)
+    return on & (near.beyond <= LANE_BEYOND) & graph.usable[near.lines]
 
 
 def match(
@@ -255,8 +279,7 @@ def match(
     `moved` are the metres from each pose to the next; `barred` lanes are not matched
     at a pose.
     """
-    on = (near.distance <= LANE_REACH) & (near.turn <= LANE_ANGLE) & ~barred
-    on &= graph.usable[near.lines]
+    on = on_lane(graph, near) & ~barred
     used = np.flatnonzero(on.any(0))
     lanes = near.lines[used]
     cost = (near.distance / DISTANCE_SCALE) ** 2 / 2 + (

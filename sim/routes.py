@@ -16,13 +16,13 @@ from jaxtyping import Float, Int
 from sim import lane_paths
 from sim.lane_paths import CHUNK, MAX_CHUNKS, ON, Chunks, Line, Piece
 from sim.lanes import (
-    LANE_ANGLE,
     LANE_REACH,
     NOWHERE,
     LaneGraph,
     arc_lengths,
     lane_graph,
     nearest,
+    on_lane,
     turned,
 )
 from sim.scene import ObjectType, RoadKind, Scene, SceneError
@@ -41,7 +41,7 @@ PER_OBJECT = (
 PER_CHUNK = ("path_chunk", "path_flags", "path_offset")
 
 
-class _Drive(NamedTuple):
+class Drive(NamedTuple):
     """The valid part of an object's log."""
 
     xy: Float[np.ndarray, "steps 2"]  # m
@@ -67,7 +67,7 @@ def routes_of(scene: Scene, origin: Float[np.ndarray, "3"]) -> dict[str, Any]:
     marks = np.zeros((5, scene.objects), np.float32)
     rows = [_Row(*np.zeros((3, 0)))] * scene.objects
     for index in range(scene.objects):
-        drive = _drive(scene, index, origin[:2])
+        drive = drive_of(scene, index, origin[:2])
         if drive is None:
             continue
         cyclist = scene.object_types[index] == ObjectType.CYCLIST
@@ -76,7 +76,7 @@ def routes_of(scene: Scene, origin: Float[np.ndarray, "3"]) -> dict[str, Any]:
         first = last = NOWHERE
         pieces: list[Piece] = []
         if not walks and len(own.lines):
-            pieces, first, last = _paths(own, drive)
+            pieces, first, last = paths_of(own, drive)
         if index == scene.sdc_index and scene.sdc_paths:
             pieces = lane_paths.sample_pieces(scene.sdc_paths, origin[:2])
         onward = np.zeros((0, 2)) if walks else _onward(own, drive, last)
@@ -93,21 +93,22 @@ def routes_of(scene: Scene, origin: Float[np.ndarray, "3"]) -> dict[str, Any]:
         "route": route,
         **dict(zip(PER_OBJECT, [spacing, *marks], strict=True)),
         **_packed(rows),
-        "chunks": np.array(table.points, np.float32).reshape(-1, CHUNK + 1, 2),
+        "chunks": np.array(table.points, np.float32).reshape(-1, 2, CHUNK + 1),
         "stop_position": _stops(scene, graph, origin[:2]).astype(np.float32),
     }
 
 
-def _drive(scene: Scene, index: int, origin: Float[np.ndarray, "2"]) -> _Drive | None:
+def drive_of(scene: Scene, index: int, origin: Float[np.ndarray, "2"]) -> Drive | None:
+    """The object's log, positions less `origin`; None where it has none."""
     seen = np.flatnonzero(scene.valid[index])
     if not len(seen):
         return None
     start = min(int(np.searchsorted(seen, scene.current_step)), len(seen) - 1)
     xy = scene.position[index, seen, :2] - origin
-    return _Drive(xy, scene.yaw[index, seen], start)
+    return Drive(xy, scene.yaw[index, seen], start)
 
 
-def _paths(graph: LaneGraph, drive: _Drive) -> tuple[list[Piece], int, int]:
+def paths_of(graph: LaneGraph, drive: Drive) -> tuple[list[Piece], int, int]:
     """The paths from where it starts to act, and the first and last lane."""
     xy, yaw = drive.xy[drive.start :], drive.yaw[drive.start :]
     kept = lane_paths.poses(xy)
@@ -116,7 +117,7 @@ def _paths(graph: LaneGraph, drive: _Drive) -> tuple[list[Piece], int, int]:
 
 
 def _logged(
-    drive: _Drive, onward: Float[np.ndarray, "more 2"]
+    drive: Drive, onward: Float[np.ndarray, "more 2"]
 ) -> tuple[Float[np.ndarray, "points 2"], float, float, float]:
     """The logged path and `onward`, equally spaced; the spacing; where the log is."""
     knots, reached = _knots(drive.xy)
@@ -151,16 +152,13 @@ def _knots(
     return path[kept], np.array(reached)
 
 
-def _onward(
-    graph: LaneGraph, drive: _Drive, lane: int
-) -> Float[np.ndarray, "points 2"]:
+def _onward(graph: LaneGraph, drive: Drive, lane: int) -> Float[np.ndarray, "points 2"]:
     """The lanes' centres from `REJOIN` ahead of the log's end, `ROUTE_AHEAD` long."""
     none = np.zeros((0, 2))
     if not len(graph.lines):
         return none
     near = nearest(graph.segments, drive.xy[-1:], drive.yaw[-1:], LANE_REACH)
-    on = (near.distance[0] <= LANE_REACH) & (near.turn[0] <= LANE_ANGLE)
-    on &= np.isin(near.lines, np.flatnonzero(graph.usable))
+    on = on_lane(graph, near)[0]
     if not on.any():
         return none
     column = int(np.where(on, near.distance[0], np.inf).argmin())
@@ -239,18 +237,19 @@ class _Table:
         else:
             cut = lane_paths.chunks_of(line)
         entry = (len(self.points), cut)
-        self.points += list(cut.points)
+        self.points += list(cut.points.transpose(0, 2, 1))
         if isinstance(line, int):
             self._lanes[line] = entry
         return entry
 
-    def extent(self, row: _Row, drive: _Drive) -> tuple[float, float]:
+    def extent(self, row: _Row, drive: Drive) -> tuple[float, float]:
         """Arc lengths on the nearest on-route path where the log starts and ends."""
         on = row.flags & ON > 0
         if not on.any():
             return 0.0, 0.0
         points = np.array([self.points[chunk] for chunk in row.chunk[on]])
         ends = drive.xy[[drive.start, -1]]
+        points = points.transpose(0, 2, 1)
         start, along = points[:, :-1], np.diff(points, axis=1)
         lengths = np.hypot(along[..., 0], along[..., 1])
         arc = row.offset[on][:, None] + np.cumsum(lengths, 1) - lengths
