@@ -23,8 +23,8 @@ Where the matched lanes would leave the log itself off-route (two lanes overlap,
 log is nearer to the one that it does not follow) these poses are matched again without
 that lane, so that a log is never off-route.
 
-The SDC's paths are the scene's `sdc_paths` where there are some; arc length is then
-along the first of the on-route samples that a stretch is part of.
+The SDC's paths are the scene's `sdc_paths` where there are some, cut in the same way;
+arc length is then along the first of the on-route samples that a stretch is part of.
 """
 
 import itertools
@@ -98,7 +98,8 @@ def object_pieces(
         runs = _runs(graph, lanes, moved)
         if not any(run.lanes for run in runs):
             return [], lanes
-        pieces = _pieces(graph, near, xy, runs)
+        chains, driven, end = _chains(graph, near, xy, runs)
+        pieces = driven + pieces_of(graph, chains, max(end + AHEAD, RANGE))
         wrong = np.flatnonzero(_off_route(near, pieces, xy))
         if not len(wrong):
             break
@@ -142,7 +143,7 @@ def _runs(
     return runs
 
 
-class _Chain(NamedTuple):
+class Chain(NamedTuple):
     """A run's lanes with the arc lengths of their starts."""
 
     lanes: tuple[int, ...]
@@ -151,21 +152,22 @@ class _Chain(NamedTuple):
 
 def _chains(
     graph: LaneGraph, near: Near, xy: Float[np.ndarray, "poses 2"], runs: list[_Run]
-) -> tuple[list[_Chain], list[Piece], float]:
+) -> tuple[list[Chain], list[Piece], float]:
     """The runs on lanes, those off them, and the arc length at the log's end."""
     column = {int(lane): index for index, lane in enumerate(near.lines)}
-    chains: list[_Chain] = []
+    station = near.arc + near.beyond
+    chains: list[Chain] = []
     driven: list[Piece] = []
     reached = 0.0
     for run in runs:
         before = max(run.first - 1, 0)
         left, reached = reached, reached + _length(xy[before : run.first + 1])
         if run.lanes:
-            start = reached - float(near.arc[run.first, column[run.lanes[0]]])
+            start = reached - float(station[run.first, column[run.lanes[0]]])
             lengths = [float(graph.arcs[lane][-1]) for lane in run.lanes]
             offsets = tuple((start + np.cumsum([0.0, *lengths[:-1]])).tolist())
-            reached = offsets[-1] + float(near.arc[run.last, column[run.lanes[-1]]])
-            chains.append(_Chain(run.lanes, offsets))
+            reached = offsets[-1] + float(station[run.last, column[run.lanes[-1]]])
+            chains.append(Chain(run.lanes, offsets))
             continue
         reached += _length(xy[run.first : run.last + 1])
         points = xy[before : run.last + 2]
@@ -178,12 +180,8 @@ def _length(points: Float[np.ndarray, "points 2"]) -> float:
     return float(np.hypot(*np.diff(points, axis=0).T).sum())
 
 
-def _pieces(
-    graph: LaneGraph, near: Near, xy: Float[np.ndarray, "poses 2"], runs: list[_Run]
-) -> list[Piece]:
-    """The paths through these runs."""
-    chains, driven, end = _chains(graph, near, xy, runs)
-    limit = max(end + AHEAD, RANGE)
+def pieces_of(graph: LaneGraph, chains: list[Chain], limit: float) -> list[Piece]:
+    """The paths through these runs, over lanes that begin within `limit`."""
     on: list[Piece] = []
     off: dict[int, float] = {}
     for number, (lanes, offsets) in enumerate(chains):
@@ -216,7 +214,7 @@ def _pieces(
     pieces += [
         Piece(lane, way, OFF) for lane, way in off.items() if lane not in on_lanes
     ]
-    return driven + pieces
+    return pieces
 
 
 def _off_route(
@@ -241,10 +239,17 @@ def _off_route(
 
 
 def sample_pieces(
-    paths: Sequence[LanePath], origin: Float[np.ndarray, "2"]
+    paths: Sequence[LanePath],
+    origin: Float[np.ndarray, "2"],
+    ends: Float[np.ndarray, "2 2"],
 ) -> list[Piece]:
-    """The paths that samples describe; stretches that several share are there once."""
-    points = [without_repeats(path.points[:, :2] - origin) for path in paths]
+    """The paths that samples describe; stretches that several share are there once.
+
+    `ends` are where the log begins and ends [m]: a sample is cut as a lane path is.
+    """
+    points = [
+        _cut(without_repeats(path.points[:, :2] - origin), ends) for path in paths
+    ]
     flags: dict[bytes, int] = {}
     for path, line in zip(paths, points, strict=True):
         for key in _keys(line):
@@ -265,6 +270,17 @@ def sample_pieces(
                 part = Line(stretch, arc_lengths(stretch))
                 pieces.append(Piece(part, float(arc[start]), marks[start]))
     return pieces
+
+
+def _cut(
+    line: Float[np.ndarray, "points 2"], ends: Float[np.ndarray, "2 2"]
+) -> Float[np.ndarray, "kept 2"]:
+    """The path up to `AHEAD` behind the log's end or `RANGE` behind its start."""
+    if len(line) < 2:
+        return line
+    arc = arc_lengths(line)
+    at = nearest(segments_of([line], [arc]), ends, np.zeros(2), np.inf).arc[:, 0]
+    return line[arc <= max(at[1] + AHEAD, at[0] + RANGE)]
 
 
 def _keys(line: Float[np.ndarray, "points 2"]) -> list[bytes]:

@@ -225,7 +225,7 @@ class Near(NamedTuple):
     distance: Float[np.ndarray, "poses lines"]  # m
     arc: Float[np.ndarray, "poses lines"]  # m, along the line
     turn: Float[np.ndarray, "poses lines"]  # rad between heading and line, 0 to pi
-    beyond: Float[np.ndarray, "poses lines"]  # m past the line's end, or before it
+    beyond: Float[np.ndarray, "poses lines"]  # m past the line's end; before it < 0
 
 
 def nearest(
@@ -258,14 +258,14 @@ def nearest(
         distance[:, column] = apart[every, best]
         where[:, column] = arc[best] + t[every, best] * length
         turn[:, column] = turned(yaw, _angle(along[best]))
-        beyond[:, column] = np.abs(part - t)[every, best] * length
+        beyond[:, column] = (part - t)[every, best] * length
     return Near(lines, distance, where, turn, beyond)
 
 
 def on_lane(graph: LaneGraph, near: Near) -> Bool[np.ndarray, "poses lines"]:
     """Whether an object of a pose may be on a lane."""
     on = (near.distance <= LANE_REACH) & (near.turn <= LANE_ANGLE)
-    return on & (near.beyond <= LANE_BEYOND) & graph.usable[near.lines]
+    return on & (np.abs(near.beyond) <= LANE_BEYOND) & graph.usable[near.lines]
 
 
 def match(

@@ -78,7 +78,8 @@ def routes_of(scene: Scene, origin: Float[np.ndarray, "3"]) -> dict[str, Any]:
         if not walks and len(own.lines):
             pieces, first, last = paths_of(own, drive)
         if index == scene.sdc_index and scene.sdc_paths:
-            pieces = lane_paths.sample_pieces(scene.sdc_paths, origin[:2])
+            ends = drive.xy[[drive.start, -1]]
+            pieces = lane_paths.sample_pieces(scene.sdc_paths, origin[:2], ends)
         onward = np.zeros((0, 2)) if walks else _onward(own, drive, last)
         route[index], spacing[index], *marks[:2, index] = _logged(drive, onward)
         marks[2, index] = own.speed_limit[first] if first != NOWHERE else 0.0

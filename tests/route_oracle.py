@@ -28,8 +28,9 @@ def raw_paths(scene: Scene, origin: np.ndarray) -> list[list[Part]]:
         drive = drive_of(scene, index, origin[:2])
         cyclist = scene.object_types[index] == ObjectType.CYCLIST
         pieces: list[Piece] = []
-        if index == scene.sdc_index and scene.sdc_paths:
-            pieces = sample_pieces(scene.sdc_paths, origin[:2])
+        if index == scene.sdc_index and scene.sdc_paths and drive:
+            ends = drive.xy[[drive.start, -1]]
+            pieces = sample_pieces(scene.sdc_paths, origin[:2], ends)
         elif drive and lanes and scene.object_types[index] != ObjectType.PEDESTRIAN:
             pieces = paths_of(graph if cyclist else motor, drive)[0]
         every.append(
