@@ -58,6 +58,8 @@ class StatsReply(Message, frozen=True, kw_only=True, tag=True):
     stale_updates: Count  # priorities for rows that were gone
     pending_samples: Count
     mean_priority_mass: float  # of the rows in the table
+    durable: bool  # rows outlive the service's process
+    fault: str  # why nothing can be stored at present; empty if it can
     writers: list[WriterStats]
 
 

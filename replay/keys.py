@@ -63,6 +63,11 @@ class RunKeys:
         return f"slipstream/{self.run_id}/replay/{self.shard}/stats"
 
     @property
+    def sync(self) -> str:
+        """Queries that are answered once all rows of now are on the disk."""
+        return f"slipstream/{self.run_id}/replay/{self.shard}/sync"
+
+    @property
     def weights(self) -> str:
         """The policy's parameters: published, and kept for those who join late."""
         return f"slipstream/{self.run_id}/weights"

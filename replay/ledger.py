@@ -62,6 +62,22 @@ class Ledger(Generic[T]):
         self.dropped: deque[T] = deque()
         """What waited and will not be stored; the caller lets go of the queries."""
 
+    def __len__(self) -> int:
+        """How many writers there are."""
+        return len(self._writers)
+
+    def __contains__(self, writer: object) -> bool:
+        """Whether a writer of this number has been seen."""
+        return writer in self._writers
+
+    def restore(
+        self, *, writer: int, epoch: int, next_sequence: int, rows: int
+    ) -> None:
+        """Takes up a writer where a former life of the service left it."""
+        self._writers[writer] = WriterState(
+            writer=writer, epoch=epoch, next_sequence=next_sequence, rows=rows
+        )
+
     def __iter__(self) -> Iterator[WriterState[T]]:
         """All writers, in the order of their numbers."""
         return iter(sorted(self._writers.values(), key=lambda state: state.writer))

@@ -17,6 +17,14 @@ samples. Write d = (I - m) s - S, the samples owed.
 - Filling (I < m, nothing sampled yet): samples wait; the batch that crosses m may
   bring at most e / s rows more than m. Batches of any size up to a are allowed for,
   so at worst a - 1 rows cross:  e >= (a - 1) s.
+
+With `max_times_sampled` M > 0 a row is removed at its M-th draw, so the table can fall
+below m again while samples are owed. Then, and while filling, inserts of any size are
+allowed as long as I - D < m (Reverb's rule for one item at a time), or the batch that
+crosses m could be held for ever. Two further conditions:
+
+- S <= M I always, so the ratio can only be met if s <= M;
+- m rows have at least m draws left, so samples of b <= m rows are always possible.
 """
 
 from dataclasses import dataclass
@@ -37,6 +45,7 @@ class RateLimiter:
     samples_per_insert: float
     min_size: int
     tolerance: float  # e, in samples
+    max_times_sampled: int = 0  # M; 0 is no limit
 
     def __post_init__(self) -> None:
         """Refuses settings that mean nothing."""
@@ -47,6 +56,19 @@ class RateLimiter:
             )
         if not 0 <= self.tolerance < float("inf"):
             raise LimiterError(f"tolerance={self.tolerance} must be finite and >= 0")
+        most = self.max_times_sampled
+        if not 0 <= most < 1 << 31:
+            raise LimiterError(
+                f"max_times_sampled={most} must be 0 (no limit) to {(1 << 31) - 1}"
+            )
+        if 0 < most < self.samples_per_insert:
+            raise LimiterError(
+                f"max_times_sampled={most} is below samples_per_insert="
+                f"{self.samples_per_insert:g}: no row is sampled more often than "
+                f"{most} times, so samples can never exceed inserts x {most} and the "
+                "ratio is never reached; raise max_times_sampled or lower "
+                "samples_per_insert"
+            )
 
     def _owed(self, inserts: int, samples: int) -> float:
         """Samples that the inserted rows still allow, 0 at the exact ratio."""
@@ -55,6 +77,8 @@ class RateLimiter:
     def may_insert(self, n: int, *, inserts: int, deletes: int, samples: int) -> bool:
         """Whether `n` more rows may be inserted at once."""
         if inserts + n - deletes <= self.min_size:
+            return True
+        if self.max_times_sampled and inserts - deletes < self.min_size:
             return True
         return self._owed(inserts + n, samples) <= self.tolerance
 
@@ -69,6 +93,15 @@ class RateLimiter:
         per_insert = insert_rows * self.samples_per_insert
         both = (sample_rows + per_insert) / 2
         filling = (insert_rows - 1) * self.samples_per_insert
+        if self.max_times_sampled:
+            filling = 0.0
+            if sample_rows > self.min_size:
+                raise LimiterError(
+                    f"rate limiter would deadlock: min_size={self.min_size} rows may "
+                    f"have one draw left each (max_times_sampled="
+                    f"{self.max_times_sampled}), too few for samples of {sample_rows}; "
+                    "raise min_size or use smaller batches"
+                )
         if self.tolerance >= max(both, filling):
             return
         if self.tolerance < both:

@@ -5,13 +5,17 @@ process has the same semantics and, under a seed, the same draws every time.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import final
 
 import numpy as np
 from jaxtyping import Float, Integer, UInt8
 
 from replay.limiter import LimiterError, RateLimiter
+from replay.mapped import MappedStorage, open_storage
+from replay.selectors import SamplerName
 from replay.spec import ReplayError, RowSpec, Sample
+from replay.storage import AbstractStorage, MemoryStorage, WriterMark
 from replay.table import Table
 from replay.wire import SampleReplyBuffer
 
@@ -31,6 +35,18 @@ class ReplayConfig:
     """Deviation from that ratio, as a fraction of samples_per_insert * min_size."""
     priority_exponent: float = 0.6
     """Rows are drawn by priority to this power; 0 draws uniformly."""
+    sampler: SamplerName = "prioritized"
+    """How rows are drawn: by priority, uniform(ly), or always the oldest (fifo)."""
+    max_times_sampled: int = 0
+    """A row is removed once it was drawn so often; 0 is no limit."""
+    durable: bool = False
+    """Keep the rows in files of the run's folder: nothing stored is lost when the
+    service is killed, and a resumed run goes on with them."""
+    sync_s: float = 5.0
+    """Seconds between two writes to the disk; a power loss costs up to twice that."""
+    preallocate: bool = True
+    """Take the disk space of the whole capacity at the start. Otherwise as the table
+    fills: then a full disk stops inserts until there is room."""
 
     def __post_init__(self) -> None:
         """Refuses settings that can never be met."""
@@ -39,6 +55,13 @@ class ReplayConfig:
                 f"capacity={self.capacity} is below min_size={self.min_size}: the "
                 "learner would wait for ever"
             )
+        if self.sampler == "fifo" and not self.max_times_sampled:
+            raise ReplayError(
+                "sampler=fifo without max_times_sampled would draw the oldest row for "
+                "ever; set how often a row is drawn before it is removed, e.g. 1"
+            )
+        if not 0 < self.sync_s < float("inf"):
+            raise ReplayError(f"sync_s={self.sync_s} must be above 0 and finite")
         self.limiter()
 
     def limiter(self) -> RateLimiter:
@@ -47,6 +70,7 @@ class ReplayConfig:
             samples_per_insert=self.samples_per_insert,
             min_size=self.min_size,
             tolerance=self.tolerance * self.samples_per_insert * self.min_size,
+            max_times_sampled=self.max_times_sampled,
         )
 
 
@@ -54,21 +78,59 @@ class ReplayConfig:
 class LocalReplay:
     """Table, limiter and counters. Not thread-safe."""
 
-    def __init__(self, *, spec: RowSpec, config: ReplayConfig, seed: int) -> None:
-        """An empty replay; the seed decides what is drawn."""
+    def __init__(
+        self,
+        *,
+        spec: RowSpec,
+        config: ReplayConfig,
+        seed: int,
+        folder: Path | None = None,
+    ) -> None:
+        """What `folder` holds if the configuration is durable, else an empty replay.
+
+        The seed decides what is drawn.
+        """
         self.spec = spec
         self.config = config
         self.limiter = config.limiter()
+        self._storage = _storage_of(spec=spec, config=config, folder=folder)
+        state = self._storage.state
         self.table = Table(
             capacity=config.capacity,
             spec=spec,
             priority_exponent=config.priority_exponent,
-            seed=seed,
+            # A life that goes on draws something else than the one before.
+            seed=np.random.SeedSequence([seed, state.samples])
+            if state.inserts
+            else seed,
+            sampler=config.sampler,
+            max_times_sampled=config.max_times_sampled,
+            storage=self._storage,
         )
-        self.samples = 0
+        self.samples = state.samples
         """Rows ever sampled."""
         self.stale_updates = 0
         """Priority updates for rows that were gone."""
+
+    @property
+    def writers(self) -> tuple[WriterMark, ...]:
+        """Where the writers stood when the storage was opened."""
+        return self._storage.state.writers
+
+    @property
+    def durable(self) -> MappedStorage | None:
+        """The storage that outlives the process, if it does."""
+        return self._storage if isinstance(self._storage, MappedStorage) else None
+
+    @property
+    def fault(self) -> str:
+        """Why nothing can be stored at present; empty if it can."""
+        return self._storage.fault
+
+    def close(self) -> None:
+        """Writes everything to the disk and lets go of the folder."""
+        if isinstance(self._storage, MappedStorage):
+            self._storage.close()
 
     @property
     def size(self) -> int:
@@ -86,13 +148,14 @@ class LocalReplay:
         return self.samples / max(1, self.inserts)
 
     def may_insert(self, n: int) -> bool:
-        """Whether the limiter admits `n` more rows."""
-        return self.limiter.may_insert(
+        """Whether the limiter admits `n` more rows, and there is room for them."""
+        admitted = self.limiter.may_insert(
             n,
             inserts=self.table.inserts,
             deletes=self.table.deletes,
             samples=self.samples,
         )
+        return admitted and self._storage.admits(n, inserts=self.table.inserts)
 
     def may_sample(self, n: int) -> bool:
         """Whether the limiter admits `n` more samples."""
@@ -105,13 +168,21 @@ class LocalReplay:
 
     def insert(self, rows: np.ndarray) -> None:
         """Stores structured rows; raises if the limiter does not admit them."""
+        if self.durable and not self.may_insert(len(rows)):
+            self.durable.wait()  # it may be the disk that does not admit them yet
         self.insert_bytes(self.spec.as_bytes(rows))
 
-    def insert_bytes(self, rows: UInt8[np.ndarray, "rows row_bytes"]) -> None:
-        """The same for rows as bytes."""
+    def insert_bytes(
+        self,
+        rows: UInt8[np.ndarray, "rows row_bytes"],
+        mark: WriterMark | None = None,
+    ) -> None:
+        """The same for rows as bytes, and where their writer stands with them."""
         if not self.may_insert(len(rows)):
-            raise LimiterError(f"{len(rows)} inserts before more is sampled")
-        self.table.insert(rows)
+            raise LimiterError(
+                self.fault or f"{len(rows)} inserts before more is sampled"
+            )
+        self.table.insert(rows, mark)
 
     def sample(self, batch_size: int) -> Sample:
         """One batch; raises if the limiter does not admit it."""
@@ -137,6 +208,7 @@ class LocalReplay:
             rows=buffer.rows,
         )
         self.samples += count
+        self._storage.count_samples(self.samples)
         return buffer
 
     def update_priorities(
@@ -148,3 +220,25 @@ class LocalReplay:
         self.stale_updates += self.table.update_priorities(
             ids, np.asarray(priorities, np.float64)
         )
+
+
+def _storage_of(
+    *, spec: RowSpec, config: ReplayConfig, folder: Path | None
+) -> AbstractStorage:
+    """Mapped files if the configuration is durable, else memory."""
+    if not config.durable:
+        return MemoryStorage(
+            capacity=config.capacity,
+            row_bytes=spec.row_bytes,
+            count_draws=config.max_times_sampled > 0,
+        )
+    if folder is None:
+        raise ReplayError("a durable replay needs a folder")
+    return open_storage(
+        folder,
+        spec=spec,
+        capacity=config.capacity,
+        count_draws=config.max_times_sampled > 0,
+        sync_s=config.sync_s,
+        preallocate=config.preallocate,
+    )

@@ -6,8 +6,9 @@ time that its sender allows is answered "busy". When a batch is answered so, its
 writer's later ones are too: without it they could not be stored. Batch sizes with
 which the limiter would deadlock are refused when they first appear.
 
-Rows live in memory only: a service that is killed comes back empty and takes the
-writers up where they are (see `replay.ledger`).
+Unless the configuration is durable (`replay.mapped`), rows live in memory only: a
+service that is killed comes back empty and takes the writers up where they are (see
+`replay.ledger`).
 """
 
 import queue
@@ -15,25 +16,24 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import final
 
 import zenoh
 
-from replay.control import StatsReply, WriterStats, encode
+from replay.control import StatsReply, encode
+from replay.counters import Counters, stats_reply
+from replay.inserts import InsertDesk
 from replay.keys import RunKeys
-from replay.ledger import Ledger, Verdict
 from replay.limiter import LimiterError
 from replay.local import LocalReplay, ReplayConfig
-from replay.requests import HeldInsert, HeldSample, answer, end, payload_of
+from replay.requests import HeldSample, answer, end, payload_of
 from replay.session import undeclare
 from replay.spec import ReplayError, RowSpec
 from replay.table import PriorityError
 from replay.wire import (
     FetchRequest,
-    Insert,
-    InsertReply,
     SampleReplyBuffer,
     SampleRequest,
     Status,
@@ -44,20 +44,6 @@ from replay.wire import (
 __all__ = ["ReplayConfig", "ReplayServer"]
 
 _LONGEST_WAIT_S = 0.1  # between looks at the stop event
-
-
-@final
-@dataclass(kw_only=True)
-class _Counters:
-    """What `StatsReply` tells beyond the table's own counters."""
-
-    insert_wait_s: float = 0.0
-    sample_wait_s: float = 0.0
-    busy_inserts: int = 0
-    busy_samples: int = 0
-    duplicates: int = 0
-    gaps: int = 0
-    refused: int = 0
 
 
 @final
@@ -72,19 +58,29 @@ class ReplayServer:
         spec: RowSpec,
         config: ReplayConfig,
         seed: int = 0,
+        folder: Path | None = None,
     ) -> None:
-        """Makes the empty table; requests are taken from `run` on."""
+        """Makes the table, or takes up that of `folder` if the configuration says so.
+
+        Requests are taken from `run` on.
+        """
         self._session = session
         self._keys = keys
         self._spec = spec
-        self._replay = LocalReplay(spec=spec, config=config, seed=seed)
+        self._replay = LocalReplay(spec=spec, config=config, seed=seed, folder=folder)
         self._incarnation = secrets.randbits(63)
         self._events: queue.SimpleQueue[tuple[str, zenoh.Query, float]]
         self._events = queue.SimpleQueue()
-        self._ledger: Ledger[HeldInsert] = Ledger()
-        self._inserts: deque[HeldInsert] = deque()
         self._samples: deque[HeldSample] = deque()
-        self._counters = _Counters()
+        self._syncs: deque[tuple[int, zenoh.Query, StatsReply]] = deque()
+        self._counters = Counters()
+        self._inserts = InsertDesk(
+            spec=spec,
+            replay=self._replay,
+            counters=self._counters,
+            incarnation=self._incarnation,
+            check_rows=lambda rows: self._check_batches(insert_rows=rows),
+        )
         self._insert_rows = 1  # the largest batches seen
         self._sample_rows = 1
         self._ready = threading.Event()
@@ -96,10 +92,11 @@ class ReplayServer:
     def run(self, stop: threading.Event) -> None:
         """Serves until `stop` is set."""
         handlers = {
-            "insert": (self._keys.insert, self._on_insert),
+            "insert": (self._keys.insert, self._inserts.take),
             "sample": (self._keys.sample, self._on_sample),
             "fetch": (self._keys.fetch, self._on_fetch),
             "stats": (self._keys.stats, self._on_stats),
+            "sync": (self._keys.sync, self._on_sync),
         }
         queryables = [
             self._session.declare_queryable(key, self._enqueue(name))
@@ -108,22 +105,24 @@ class ReplayServer:
         self._ready.set()
         try:
             while not stop.is_set():
-                try:
-                    event = self._events.get(timeout=self._next_deadline())
-                except queue.Empty:
-                    self._expire()
-                    continue
-                while True:
-                    name, query, arrived = event
+                for name, query, arrived in self._next_events():
                     handlers[name][1](query, arrived)
-                    if self._events.empty():
-                        break
-                    event = self._events.get()
+                self._tend_disk()
                 self._admit()
                 self._expire()
         finally:
             undeclare(*queryables)
             self._let_go()
+            self._replay.close()
+
+    def _next_events(self) -> Iterator[tuple[str, zenoh.Query, float]]:
+        """What has come; waits for the first until something is due."""
+        try:
+            yield self._events.get(timeout=self._next_deadline())
+            while not self._events.empty():
+                yield self._events.get()
+        except queue.Empty:
+            return
 
     def _enqueue(self, name: str) -> Callable[[zenoh.Query], None]:
         """The callback of a queryable: runs on Zenoh's thread, so it only enqueues."""
@@ -133,97 +132,6 @@ class ReplayServer:
             events.put((name, query, time.monotonic()))
 
         return on_query
-
-    # Inserts
-
-    def _on_insert(self, query: zenoh.Query, arrived: float) -> None:
-        try:
-            message = Insert.decode(payload_of(query), self._spec)
-            self._check_batches(insert_rows=len(message.rows))
-        except ReplayError as error:
-            self._counters.refused += 1
-            reply = InsertReply(
-                status=Status.REFUSED,
-                writer=0,
-                epoch=0,
-                next_sequence=0,
-                incarnation=self._incarnation,
-                reason=str(error),
-            )
-            answer(query, reply.encode(self._spec))
-            return
-        verdict, state = self._ledger.judge(
-            writer=message.writer,
-            epoch=message.epoch,
-            sequence=message.sequence,
-            base=message.base,
-        )
-        self._drop_superseded()
-        held = HeldInsert(message=message, query=query, arrived=arrived, state=state)
-        if verdict is Verdict.NEXT:
-            state.waiting.append(held)
-            self._inserts.append(held)
-        elif verdict is Verdict.REPLACES:
-            earlier = state.waiting[message.sequence - state.next_sequence]
-            end(earlier.query)
-            earlier.query, earlier.arrived = query, arrived
-        else:
-            self._answer_unstored(held, verdict)
-
-    def _answer_unstored(self, held: HeldInsert, verdict: Verdict) -> None:
-        """Duplicates, gaps and stale batches are answered at once."""
-        if verdict is Verdict.DUPLICATE:
-            self._counters.duplicates += 1
-            self._acknowledge(held, Status.OK)
-        elif verdict is Verdict.GAP:
-            self._counters.gaps += 1
-            self._acknowledge(held, Status.GAP)
-        else:
-            self._counters.refused += 1
-            reason = (
-                f"writer {held.message.writer} of epoch {held.message.epoch} was "
-                f"replaced by a process of epoch {held.state.epoch}; give every actor "
-                "its own number"
-            )
-            self._acknowledge(held, Status.STALE, reason)
-
-    def _drop_superseded(self) -> None:
-        """Lets go of what waited for a writer that has moved on."""
-        while self._ledger.dropped:
-            held = self._ledger.dropped.popleft()
-            end(held.query)
-            held.query = None
-
-    def _acknowledge(self, held: HeldInsert, status: Status, reason: str = "") -> None:
-        """Answers with the writer's next sequence."""
-        if held.query is None:
-            return
-        reply = InsertReply(
-            status=status,
-            writer=held.message.writer,
-            epoch=held.message.epoch,
-            next_sequence=held.state.next_sequence,
-            incarnation=self._incarnation,
-            reason=reason,
-        )
-        answer(held.query, reply.encode(self._spec))
-        held.query = None
-
-    def _admit_insert(self) -> bool:
-        """Stores the first waiting batch if the limiter lets it."""
-        while self._inserts and self._inserts[0].query is None:
-            self._inserts.popleft()
-        if not self._inserts:
-            return False
-        held = self._inserts[0]
-        if not self._replay.may_insert(len(held.message.rows)):
-            return False
-        self._inserts.popleft()
-        self._replay.insert_bytes(held.message.rows)
-        self._ledger.stored(held.state, len(held.message.rows))
-        self._counters.insert_wait_s += time.monotonic() - held.arrived
-        self._acknowledge(held, Status.OK)
-        return True
 
     # Samples
 
@@ -273,12 +181,12 @@ class ReplayServer:
 
     def _admit(self) -> None:
         """Goes on while either side can: each may be what the other waits for."""
-        while self._admit_insert() | self._admit_sample():
+        while self._inserts.admit() | self._admit_sample():
             pass
 
     def _next_deadline(self) -> float:
         """Seconds until a held request must be answered, 0.1 at most."""
-        deadlines = [held.deadline for held in self._inserts]
+        deadlines = self._inserts.deadlines()
         deadlines += [held.deadline for held in self._samples]
         if not deadlines:
             return _LONGEST_WAIT_S
@@ -287,15 +195,7 @@ class ReplayServer:
     def _expire(self) -> None:
         """Answers "busy" to what has waited as long as it may."""
         now = time.monotonic()
-        for held in [h for h in self._inserts if h.deadline <= now]:
-            for late in held.state.waiting:
-                if late.query is not None:
-                    self._counters.insert_wait_s += now - late.arrived
-                    self._counters.busy_inserts += 1
-                    self._acknowledge(late, Status.BUSY)
-            held.state.waiting.clear()
-        if any(h.query is None for h in self._inserts):
-            self._inserts = deque(h for h in self._inserts if h.query is not None)
+        self._inserts.expire(now)
         for sample in [h for h in self._samples if h.deadline <= now]:
             self._samples.remove(sample)
             self._counters.sample_wait_s += now - sample.arrived
@@ -305,9 +205,8 @@ class ReplayServer:
 
     def _let_go(self) -> None:
         """Ends all held queries without an answer: their senders try again."""
-        for query in [h.query for h in self._inserts] + [
-            h.query for h in self._samples
-        ]:
+        self._inserts.let_go()
+        for query in [h.query for h in self._samples] + [s[1] for s in self._syncs]:
             end(query)
         while not self._events.empty():
             end(self._events.get()[1])
@@ -335,37 +234,28 @@ class ReplayServer:
 
     def stats(self) -> StatsReply:
         """All counters; for the owning thread, or after `run` has returned."""
-        replay, counters = self._replay, self._counters
-        writers = [
-            WriterStats(
-                writer=state.writer,
-                epoch=state.epoch,
-                next_sequence=state.next_sequence,
-                rows=state.rows,
-                pending=len(state.waiting),
-            )
-            for state in self._ledger
-        ]
-        return StatsReply(
+        return stats_reply(
+            replay=self._replay,
+            counters=self._counters,
+            ledger=self._inserts.ledger,
             incarnation=self._incarnation,
-            schema_hash=self._spec.schema_hash.hex(),
-            capacity=replay.config.capacity,
-            size=replay.size,
-            inserts=replay.inserts,
-            samples=replay.samples,
-            deletes=replay.table.deletes,
-            samples_per_insert=replay.samples_per_insert,
-            configured_samples_per_insert=replay.config.samples_per_insert,
-            min_size=replay.config.min_size,
-            insert_wait_s=counters.insert_wait_s,
-            sample_wait_s=counters.sample_wait_s,
-            busy_inserts=counters.busy_inserts,
-            busy_samples=counters.busy_samples,
-            duplicates=counters.duplicates,
-            gaps=counters.gaps,
-            refused=counters.refused,
-            stale_updates=replay.stale_updates,
             pending_samples=len(self._samples),
-            mean_priority_mass=replay.table.mean_mass(),
-            writers=writers,
         )
+
+    def _on_sync(self, query: zenoh.Query, _: float) -> None:
+        """The counters, once all that they count is on the disk."""
+        durable = self._replay.durable
+        if durable is None:
+            answer(query, encode(self.stats()))
+        else:
+            self._syncs.append((durable.ask_sync(), query, self.stats()))
+
+    def _tend_disk(self) -> None:
+        """Starts the snapshot that is due, answers those who waited for one."""
+        durable = self._replay.durable
+        if durable is None:
+            return
+        durable.tend()
+        while self._syncs and self._syncs[0][0] <= durable.synced:
+            _, query, stats = self._syncs.popleft()
+            answer(query, encode(stats))

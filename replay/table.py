@@ -1,151 +1,42 @@
 """The table: rows in a ring, and which of them are drawn how often.
 
 Rows have global ids 0, 1, 2, ... in the order of insertion; row `id` lies in slot
-`id % capacity`, so the oldest are pushed out first (FIFO). Row i is drawn with
-probability
+`id % capacity`, so the oldest are pushed out first (FIFO). Three ways to draw:
 
-    P(i) = p_i^alpha / sum_k p_k^alpha        (Schaul et al. 2016, eq. 1)
+    prioritized   row i with probability P(i) = p_i^alpha / sum_k p_k^alpha (Schaul et
+                  al. 2016, eq. 1). New rows have p = 1 (as Acme inserts them); the
+                  learner later sets |TD error|. Rows of priority 0 are not drawn; if
+                  all are 0, the draw is uniform
+    uniform       every row alike; needs no tree (and no torch), as does alpha = 0
+    fifo          always the oldest row (Reverb's Fifo selector), until it is removed
 
-New rows have priority p = 1 (as Acme inserts them); the learner later sets |TD error|.
-A batch of B is drawn stratified: one draw from each of B equal parts of the total
-mass. Rows of priority 0 are not drawn; if all are 0, the draw is uniform. alpha = 0
-is uniform sampling, and needs no tree (and no torch).
+A batch of B is drawn stratified: one draw from each of B equal parts of the total mass.
 
-The tree is torchrl's, which checks nothing: a bad index corrupts memory. So ids and
-priorities are checked here before anything is touched. It is the float64 one: drawing
-64 from a million costs 12 us against 10 in float32, and a float32 target near 10^6
-moves in steps of 0.06, so that light rows could not be drawn at all.
+`max_times_sampled` (Reverb): a row that has been drawn so often is removed at once. Its
+slot stays empty until the ring comes round, so `capacity` counts slots from the oldest
+row kept. Draws are then independent and not stratified: those of rows that are used up
+are refused and drawn again, which makes the draws exactly those taken one after the
+other, each from what is left; a draw's probability is that of the round it came in.
+
+Ids and priorities are checked here before a tree is touched.
 """
 
-import abc
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from jaxtyping import Float, Int64, Integer, UInt8, UInt64
 
+from replay.selectors import PrioritizedSelector, SamplerName, Window, make_selector
 from replay.spec import ReplayError, RowSpec
+from replay.storage import AbstractStorage, MemoryStorage, WriterMark
 
 INITIAL_PRIORITY = 1.0
 MAX_PRIORITY = 1e30  # larger ones would overflow the total mass of a full table
+_ROUNDS = 8  # of refused draws before the rows that are left are listed
 
 
 class PriorityError(ReplayError):
     """Priorities that cannot be sampled by."""
-
-
-class AbstractSelector(abc.ABC):
-    """Draws slots. Not thread-safe; its caller checks slots and priorities."""
-
-    @abc.abstractmethod
-    def set(
-        self,
-        slots: Int64[np.ndarray, " rows"],
-        priorities: Float[np.ndarray, " rows"],
-    ) -> None:
-        """Gives these slots these priorities; of a repeated slot the last holds."""
-
-    @abc.abstractmethod
-    def draw(
-        self, positions: Float[np.ndarray, " rows"], size: int
-    ) -> tuple[Int64[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
-        """Slots among the first `size` and their probabilities.
-
-        `positions` in (0, 1] are where in the total mass to draw.
-        """
-
-    @abc.abstractmethod
-    def masses(self, size: int) -> Float[np.ndarray, " rows"]:
-        """p^alpha of the first `size` slots."""
-
-    @abc.abstractmethod
-    def total(self) -> float:
-        """The sum that the draws go by."""
-
-
-@final
-class UniformSelector(AbstractSelector):
-    """Every row is equally likely."""
-
-    def set(
-        self,
-        slots: Int64[np.ndarray, " rows"],
-        priorities: Float[np.ndarray, " rows"],
-    ) -> None:
-        """Priorities make no difference."""
-
-    def draw(
-        self, positions: Float[np.ndarray, " rows"], size: int
-    ) -> tuple[Int64[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
-        """See the base class."""
-        slots = np.ceil(positions * size).astype(np.int64) - 1
-        return np.clip(slots, 0, size - 1), np.full(len(slots), 1.0 / size)
-
-    def masses(self, size: int) -> Float[np.ndarray, " rows"]:
-        """All one."""
-        return np.ones(size)
-
-    def total(self) -> float:
-        """Not known here and not needed."""
-        return float("nan")
-
-
-@final
-class PrioritizedSelector(AbstractSelector):
-    """In proportion to priority^exponent, by a sum tree."""
-
-    def __init__(self, *, capacity: int, exponent: float) -> None:
-        """Starts with no mass."""
-        # Here and not at the top: it takes seconds and half a gigabyte, and whoever
-        # only samples uniformly or reads the configuration needs none of it.
-        from torchrl._torchrl import SumSegmentTreeFp64
-
-        self._exponent = exponent
-        self._capacity = capacity
-        self._tree: Any = SumSegmentTreeFp64(capacity)
-
-    def set(
-        self,
-        slots: Int64[np.ndarray, " rows"],
-        priorities: Float[np.ndarray, " rows"],
-    ) -> None:
-        """See the base class."""
-        self._tree.update(slots, np.asarray(priorities**self._exponent, np.float64))
-
-    def draw(
-        self, positions: Float[np.ndarray, " rows"], size: int
-    ) -> tuple[Int64[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
-        """See the base class."""
-        total = self.total()
-        if total <= 0.0:
-            return UniformSelector().draw(positions, size)
-        slots = self._scan(positions * total, size)
-        masses = self._tree.at(slots)
-        # A target within rounding of a boundary can land on a row without mass.
-        for share in (0.5, 0.25, 0.75):
-            empty = masses <= 0.0
-            if not empty.any():
-                return slots, masses / total
-            moved = self._scan(positions[empty] * (total * share), size)
-            slots[empty] = moved
-            masses[empty] = self._tree.at(moved)
-        heaviest = int(np.argmax(self.masses(size)))
-        slots[masses <= 0.0] = heaviest
-        return slots, self._tree.at(slots) / total
-
-    def _scan(
-        self, targets: Float[np.ndarray, " rows"], size: int
-    ) -> Int64[np.ndarray, " rows"]:
-        """The first slot at which the running sum reaches the target."""
-        # It returns the tree's size for a target above the sum.
-        return np.minimum(self._tree.scan_lower_bound(targets), size - 1)
-
-    def masses(self, size: int) -> Float[np.ndarray, " rows"]:
-        """See the base class."""
-        return self._tree.at(np.arange(size))
-
-    def total(self) -> float:
-        """See the base class."""
-        return float(self._tree.query(0, self._capacity))
 
 
 @final
@@ -159,53 +50,123 @@ class Table:
         spec: RowSpec,
         priority_exponent: float,
         seed: int | np.random.SeedSequence,
+        sampler: SamplerName = "prioritized",
+        max_times_sampled: int = 0,
+        storage: AbstractStorage | None = None,
     ) -> None:
-        """An empty table; its memory is taken page by page as it fills."""
+        """Takes up what the storage holds; without one, an empty table in memory."""
         if capacity < 1 or not 0.0 <= priority_exponent <= 1.0:
             raise ReplayError(
                 f"capacity={capacity} must be at least 1 and "
                 f"priority_exponent={priority_exponent} in [0, 1]"
             )
         self.capacity = capacity
-        self.inserts = 0
-        """Rows ever inserted; also the id of the next row."""
-        self._rows = np.zeros((capacity, spec.row_bytes), np.uint8)
-        self._ids = np.zeros(capacity, np.uint64)
+        self._storage = storage or MemoryStorage(
+            capacity=capacity,
+            row_bytes=spec.row_bytes,
+            count_draws=max_times_sampled > 0,
+        )
+        self._rows = self._storage.rows
+        self._most = max_times_sampled
+        self._fifo = sampler == "fifo"
         self._random = np.random.default_rng(seed)
-        self._selector: AbstractSelector = UniformSelector()
-        if priority_exponent > 0.0:
-            self._selector = PrioritizedSelector(
-                capacity=capacity, exponent=priority_exponent
-            )
+        self._selector = make_selector(
+            sampler, capacity=capacity, exponent=priority_exponent
+        )
+        self.inserts = self._storage.state.inserts
+        """Rows ever inserted; also the id of the next row."""
+        self._oldest = self._storage.state.oldest
+        self._removed = 0  # of the rows from the oldest on: drawn as often as allowed
+        self._cursor = self._oldest  # FIFO: no row below this id is left
+        self._take_up()
+
+    def _take_up(self) -> None:
+        """Rebuilds what is derived from the storage: one scan of its columns."""
+        slots = self._window.slots()
+        if not len(slots):
+            return
+        live = self._live(slots)
+        self._removed = int(len(slots) - live.sum())
+        if live.any():
+            self._cursor = self._oldest + int(np.argmax(live))
+        priorities = np.full(len(slots), INITIAL_PRIORITY)
+        if self._storage.priorities is not None:
+            priorities = self._storage.priorities[slots]
+        # What a power loss left half written must not reach the tree.
+        sound = (priorities >= 0.0) & (priorities <= MAX_PRIORITY)
+        priorities = np.where(sound, priorities, INITIAL_PRIORITY)
+        self._selector.set(slots, np.where(live, priorities, 0.0))
 
     @property
     def size(self) -> int:
         """Rows in the table."""
-        return min(self.inserts, self.capacity)
+        return self.inserts - self._oldest - self._removed
 
     @property
     def deletes(self) -> int:
-        """Rows pushed out."""
+        """Rows pushed out, or removed because they were drawn as often as allowed."""
         return self.inserts - self.size
 
-    def insert(self, rows: UInt8[np.ndarray, "rows row_bytes"]) -> None:
-        """Appends rows, pushing out the oldest; one copy, or two where it wraps."""
+    @property
+    def _window(self) -> Window:
+        """The slots from the oldest row to the newest."""
+        return Window(
+            self._oldest % self.capacity, self.inserts - self._oldest, self.capacity
+        )
+
+    def _live(self, slots: Int64[np.ndarray, " rows"]) -> np.ndarray:
+        """Which of the window's slots hold a row that may still be drawn."""
+        if self._storage.times is None:
+            return np.ones(len(slots), bool)
+        return self._storage.times[slots] < self._most
+
+    def _ids_of(self, slots: Int64[np.ndarray, " rows"]) -> Int64[np.ndarray, " rows"]:
+        """The ids of the rows in these slots of the window."""
+        return self.inserts - 1 - (self.inserts - 1 - slots) % self.capacity
+
+    # Inserting
+
+    def insert(
+        self,
+        rows: UInt8[np.ndarray, "rows row_bytes"],
+        mark: WriterMark | None = None,
+    ) -> None:
+        """Appends rows, pushing out the oldest; one copy, or two where it wraps.
+
+        `mark` says where their writer stands with them: stored together or not at all.
+        """
         count = len(rows)
         if rows.shape[1] != self._rows.shape[1] or count > self.capacity:
             raise ReplayError(
                 f"{count} rows of {rows.shape[1]} bytes do not fit a table of "
                 f"{self.capacity} rows of {self._rows.shape[1]}"
             )
-        ids = np.arange(self.inserts, self.inserts + count, dtype=np.uint64)
-        first = self.inserts % self.capacity
-        head = min(count, self.capacity - first)
-        self._rows[first : first + head] = rows[:head]
-        self._rows[: count - head] = rows[head:]
-        self._ids[first : first + head] = ids[:head]
-        self._ids[: count - head] = ids[head:]
-        slots = (ids % np.uint64(self.capacity)).astype(np.int64)
-        self._selector.set(slots, np.full(count, INITIAL_PRIORITY))
+        storage = self._storage
+        slots = (self.inserts + np.arange(count)) % self.capacity
+        self._push_out(max(self._oldest, self.inserts + count - self.capacity))
+        head = min(count, self.capacity - int(slots[0]))
+        storage.write_rows(int(slots[0]), rows[:head])
+        if head < count:
+            storage.write_rows(0, rows[head:])
+        if storage.priorities is not None:
+            storage.priorities[slots] = INITIAL_PRIORITY
+        if storage.times is not None:
+            storage.times[slots] = 0
+        storage.commit(self.inserts + count, mark)
         self.inserts += count
+        self._selector.set(slots, np.full(count, INITIAL_PRIORITY))
+
+    def _push_out(self, oldest: int) -> None:
+        """Forgets the rows below this id, before their slots are overwritten."""
+        if oldest == self._oldest:
+            return
+        if self._removed:
+            gone = np.arange(self._oldest, min(oldest, self.inserts)) % self.capacity
+            self._removed -= int(len(gone) - self._live(gone).sum())
+        self._storage.evict(oldest)
+        self._oldest = oldest
+
+    # Drawing
 
     def draw(
         self,
@@ -216,19 +177,93 @@ class Table:
         rows: UInt8[np.ndarray, "rows row_bytes"],
     ) -> None:
         """Fills the given arrays with whole batches, each stratified by itself."""
-        if self.size == 0 or len(ids) % batch_size:
+        count = len(ids)
+        if self.size == 0 or count % batch_size or not self._can_draw(count):
             raise ReplayError(
-                f"cannot draw {len(ids)} rows in batches of {batch_size} from a table "
+                f"cannot draw {count} rows in batches of {batch_size} from a table "
                 f"of {self.size}"
             )
-        strata = np.tile(np.arange(1, batch_size + 1), len(ids) // batch_size)
-        # In (0, 1]: a target of exactly 0 would find the first row even if it has
-        # no mass.
-        positions = (strata - self._random.random(len(ids))) / batch_size
-        slots, probabilities[:] = self._selector.draw(positions, self.size)
-        np.take(self._ids, slots, out=ids, mode="clip")
+        if self._fifo:
+            slots = self._draw_oldest(count)
+            probabilities[:] = 1.0
+        elif self._most:
+            slots, probabilities[:] = self._draw_limited(count)
+        else:
+            strata = np.tile(np.arange(1, batch_size + 1), count // batch_size)
+            # In (0, 1]: a target of exactly 0 would find the first row even if it has
+            # no mass.
+            positions = (strata - self._random.random(count)) / batch_size
+            slots, probabilities[:] = self._selector.draw(positions, self._window)
+        ids[:] = self._ids_of(slots)
         # "clip" because "raise" makes NumPy gather into a buffer of its own first.
         np.take(self._rows, slots, axis=0, out=rows, mode="clip")
+
+    def _can_draw(self, count: int) -> bool:
+        """Whether the rows that are left may be drawn so often in all."""
+        times = self._storage.times
+        if times is None or count <= self.size:
+            return True
+        slots = self._window.slots()
+        return bool((self._most - times[slots].astype(np.int64)).sum() >= count)
+
+    def _draw_oldest(self, count: int) -> Int64[np.ndarray, " rows"]:
+        """The oldest row as often as it may be drawn, then the next."""
+        times = self._storage.times
+        assert times is not None
+        self._cursor = max(self._cursor, self._oldest)
+        last = min(self.inserts, self._cursor + count + 1)
+        slots = np.arange(self._cursor, last) % self.capacity
+        left = self._most - times[slots].astype(np.int64)
+        drawn = np.repeat(slots, left)[:count]
+        self._use_up(drawn)
+        self._cursor = int(self._ids_of(drawn[-1:])[0])
+        return drawn
+
+    def _draw_limited(
+        self, count: int
+    ) -> tuple[Int64[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+        """Independent draws, none of a row that has been drawn often enough."""
+        times = self._storage.times
+        assert times is not None
+        slots, probabilities = np.zeros(0, np.int64), np.zeros(0)
+        rounds = 0
+        while len(slots) < count:
+            positions = 1.0 - self._random.random(count - len(slots))
+            drawn, chances = self._round(positions, listed=rounds >= _ROUNDS)
+            left = self._most - times[drawn].astype(np.int64)
+            kept = _earlier_copies(drawn) < left
+            slots = np.concatenate([slots, drawn[kept]])
+            probabilities = np.concatenate([probabilities, chances[kept]])
+            self._use_up(drawn[kept])
+            rounds += 1
+        return slots, probabilities
+
+    def _round(
+        self, positions: Float[np.ndarray, " rows"], *, listed: bool
+    ) -> tuple[Int64[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+        """Draws from what is left now; unless `listed` some may be used up."""
+        if listed:
+            slots = self._window.slots()
+            slots = slots[self._live(slots)]
+            sums = np.cumsum(self._selector.masses(slots))
+            if sums[-1] <= 0.0:
+                sums = np.arange(1.0, len(slots) + 1)
+            drawn = slots[np.searchsorted(sums, positions * sums[-1])]
+        else:
+            drawn, _ = self._selector.draw(positions, self._window)
+        total = self._selector.total(self.size)
+        if total <= 0.0:
+            return drawn, np.full(len(drawn), 1.0 / self.size)
+        return drawn, self._selector.masses(drawn) / total
+
+    def _use_up(self, slots: Int64[np.ndarray, " rows"]) -> None:
+        """Counts draws; removes the rows that may not be drawn again."""
+        times = self._storage.times
+        assert times is not None
+        np.add.at(times, slots, 1)
+        full = np.unique(slots[times[slots] >= self._most])
+        self._removed += len(full)
+        self._selector.set(full, np.zeros(len(full)))
 
     def update_priorities(
         self,
@@ -249,11 +284,18 @@ class Table:
                 f"[0, {MAX_PRIORITY:g}]; has the loss diverged?"
             )
         wanted = ids.astype(np.uint64)
-        slots = (wanted % np.uint64(self.capacity)).astype(np.int64)
-        alive = (self._ids[slots] == wanted) & (slots < self.size)
-        if alive.any():
-            self._selector.set(slots[alive], priorities[alive].astype(np.float64))
-        return int(len(ids) - alive.sum())
+        there = (wanted >= np.uint64(self._oldest)) & (wanted < np.uint64(self.inserts))
+        slots = (wanted[there] % np.uint64(self.capacity)).astype(np.int64)
+        new = priorities[there].astype(np.float64)
+        live = self._live(slots)
+        slots, new = slots[live], new[live]
+        if len(slots):
+            if self._storage.priorities is not None:
+                self._storage.priorities[slots] = new
+            self._selector.set(slots, new)
+        return int(len(ids) - len(slots))
+
+    # Questions
 
     def read(
         self, first_id: int, limit: int
@@ -262,32 +304,44 @@ class Table:
         Float[np.ndarray, " rows"],
         UInt8[np.ndarray, "rows row_bytes"],
     ]:
-        """Ids, probabilities and rows that are left of `limit` ids from `first_id`."""
-        start = max(first_id, self.deletes)
-        stop = min(start + limit, self.inserts)
-        ids = np.arange(start, max(start, stop), dtype=np.uint64)
-        slots = (ids % np.uint64(self.capacity)).astype(np.int64)
-        masses = self._selector.masses(self.size)
-        probabilities = masses / max(masses.sum(), np.finfo(np.float64).tiny)
-        return ids, probabilities[slots], self._rows[slots]
+        """Ids, probabilities and bytes of the first `limit` rows from `first_id`."""
+        start = max(first_id, self._oldest)
+        # Without removed rows the next `limit` ids are all there.
+        reach = self.inserts if self._removed else min(start + limit, self.inserts)
+        ids = np.arange(start, max(start, reach), dtype=np.int64)
+        ids = ids[self._live(ids % self.capacity)][:limit]
+        slots = ids % self.capacity
+        total = self._selector.total(self.size)
+        probabilities = self._selector.masses(slots) / max(total, 1e-300)
+        return ids.astype(np.uint64), probabilities, self._rows[slots]
 
     def mean_mass(self) -> float:
         """Mean of p^alpha over the rows in the table; 0 when it is empty."""
-        if self.size == 0 or isinstance(self._selector, UniformSelector):
-            return float(self.size > 0)
-        return self._selector.total() / self.size
+        if self.size == 0:
+            return 0.0
+        return self._selector.total(self.size) / self.size
 
     def check_invariants(self) -> None:
         """Asserts what must hold after every operation; for tests."""
-        size = self.size
-        slots = np.arange(size)
-        ids = self._ids[:size]
-        assert (ids % np.uint64(self.capacity) == slots.astype(np.uint64)).all()
-        kept = np.arange(self.deletes, self.inserts, dtype=np.uint64)
-        assert (np.sort(ids) == kept).all()
-        masses = self._selector.masses(size)
+        slots = self._window.slots()
+        assert 0 <= self._oldest <= self.inserts <= self._oldest + self.capacity
+        ids = np.arange(self._oldest, self.inserts)
+        assert (self._ids_of(slots) == ids).all()
+        live = self._live(slots)
+        assert self.size == live.sum()
+        masses = self._selector.masses(slots)
         assert (np.isfinite(masses) & (masses >= 0)).all()
         if isinstance(self._selector, PrioritizedSelector):
-            whole = self._selector.masses(self.capacity)
-            assert (whole[size:] == 0).all()
-            assert np.isclose(self._selector.total(), masses.sum(), rtol=1e-9)
+            whole = self._selector.masses(np.arange(self.capacity))
+            assert np.isclose(whole.sum(), masses[live].sum(), rtol=1e-9)
+            assert np.isclose(self._selector.total(self.size), whole.sum(), rtol=1e-9)
+
+
+def _earlier_copies(values: Int64[np.ndarray, " rows"]) -> Int64[np.ndarray, " rows"]:
+    """How often each value occurs before its place."""
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
+    starts = np.searchsorted(ordered, ordered, side="left")
+    ranks = np.empty(len(values), np.int64)
+    ranks[order] = np.arange(len(values)) - starts
+    return ranks

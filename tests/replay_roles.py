@@ -1,28 +1,44 @@
 """Roles of the replay's tests that run as processes of their own, to be killed.
 
-    python -m tests.replay_roles service ENDPOINT
+    python -m tests.replay_roles service ENDPOINT [FOLDER]
     python -m tests.replay_roles writer ENDPOINT WRITER EPOCH ROWS
+    python -m tests.replay_roles checked ENDPOINT WRITER EPOCH
 
 The writer numbers its rows from `EPOCH * 1_000_000` and prints how many rows were
-acknowledged whenever that grows; the service prints `ready`.
+acknowledged whenever that grows; the service prints `ready`. With a folder it is
+durable and its rows are checked ones; `checked` writes those until SIGTERM.
 """
 
 import signal
 import sys
 import threading
+from pathlib import Path
 
 from replay.client import Writer
 from replay.server import ReplayServer
 from replay.session import open_session
+from tests.replay_durable_parts import CHECKED, LOADED, checked_rows
 from tests.replay_parts import KEYS, OPEN, SPEC, make_rows
 
 
-def serve(endpoint: str) -> None:
-    """A service that is also the router, until SIGTERM."""
+def until_term() -> threading.Event:
+    """Set by SIGTERM."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    return stop
+
+
+def serve(endpoint: str, folder: Path | None) -> None:
+    """A service that is also the router, until SIGTERM."""
+    stop = until_term()
     session = open_session(listen=[endpoint], router=True)
-    server = ReplayServer(session=session, keys=KEYS, spec=SPEC, config=OPEN)
+    server = ReplayServer(
+        session=session,
+        keys=KEYS,
+        spec=CHECKED if folder else SPEC,
+        config=LOADED if folder else OPEN,
+        folder=folder,
+    )
     print("ready", flush=True)
     server.run(stop)
     session.close()
@@ -51,8 +67,35 @@ def write(endpoint: str, writer: int, epoch: int, rows: int) -> None:
     session.close()
 
 
+def write_checked(endpoint: str, writer: int, epoch: int) -> None:
+    """Writes rows with checksums until SIGTERM, then tells how many are stored."""
+    stop, start = until_term(), 0
+    session = open_session(connect=[endpoint], timeout_s=60.0)
+    sink = Writer(
+        session=session,
+        keys=KEYS,
+        spec=CHECKED,
+        writer=writer,
+        epoch=epoch,
+        batch_rows=10,
+        hold_s=1.0,
+    )
+    while not stop.is_set():
+        rows = checked_rows(start, 10, writer=writer)
+        # What did not fit in time is whole and offered again.
+        while not sink.append(rows, 0.2) and not stop.is_set():
+            rows = rows[:0]
+        start += 10
+        stop.wait(0.002)
+    if sink.close(60.0):
+        print("all", sink.acknowledged, flush=True)
+    session.close()
+
+
 if __name__ == "__main__":
     if sys.argv[1] == "service":
-        serve(sys.argv[2])
+        serve(sys.argv[2], Path(sys.argv[3]) if len(sys.argv) > 3 else None)
+    elif sys.argv[1] == "checked":
+        write_checked(sys.argv[2], *map(int, sys.argv[3:]))
     else:
         write(sys.argv[2], *map(int, sys.argv[3:]))

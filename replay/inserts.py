@@ -1,0 +1,179 @@
+"""The service's insert side: batches in each writer's order, held for the limiter.
+
+Owned by the service's thread. A batch is answered once it is stored; one that is not
+admitted within the time that its sender allows is answered "busy", and so are that
+writer's later ones: without it they could not be stored.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import final
+
+import zenoh
+
+from replay.counters import Counters
+from replay.ledger import Ledger, Verdict
+from replay.local import LocalReplay
+from replay.requests import HeldInsert, answer, end, payload_of
+from replay.spec import ReplayError, RowSpec
+from replay.storage import WriterMark
+from replay.wire import Insert, InsertReply, Status
+
+
+@final
+class InsertDesk:
+    """Takes batches in, stores them when it may, answers all."""
+
+    def __init__(
+        self,
+        *,
+        spec: RowSpec,
+        replay: LocalReplay,
+        counters: Counters,
+        incarnation: int,
+        check_rows: Callable[[int], None],
+    ) -> None:
+        """Takes up the writers that the replay knows; `check_rows` refuses sizes."""
+        self._spec = spec
+        self._replay = replay
+        self._counters = counters
+        self._incarnation = incarnation
+        self._check_rows = check_rows
+        self._held: deque[HeldInsert] = deque()
+        self._told = ""  # the fault that was said
+        self.ledger: Ledger[HeldInsert] = Ledger()
+        for mark in replay.writers:
+            self.ledger.restore(
+                writer=mark.writer,
+                epoch=mark.epoch,
+                next_sequence=mark.next_sequence,
+                rows=mark.rows,
+            )
+
+    def take(self, query: zenoh.Query, arrived: float) -> None:
+        """Judges a batch: it waits, or is answered at once."""
+        try:
+            message = Insert.decode(payload_of(query), self._spec)
+            self._check_rows(len(message.rows))
+        except ReplayError as error:
+            self._counters.refused += 1
+            reply = InsertReply(
+                status=Status.REFUSED,
+                writer=0,
+                epoch=0,
+                next_sequence=0,
+                incarnation=self._incarnation,
+                reason=str(error),
+            )
+            answer(query, reply.encode(self._spec))
+            return
+        verdict, state = self.ledger.judge(
+            writer=message.writer,
+            epoch=message.epoch,
+            sequence=message.sequence,
+            base=message.base,
+        )
+        self._drop_superseded()
+        held = HeldInsert(message=message, query=query, arrived=arrived, state=state)
+        if verdict is Verdict.NEXT:
+            state.waiting.append(held)
+            self._held.append(held)
+        elif verdict is Verdict.REPLACES:
+            earlier = state.waiting[message.sequence - state.next_sequence]
+            end(earlier.query)
+            earlier.query, earlier.arrived = query, arrived
+        else:
+            self._answer_unstored(held, verdict)
+
+    def _answer_unstored(self, held: HeldInsert, verdict: Verdict) -> None:
+        """Duplicates, gaps and stale batches are answered at once."""
+        if verdict is Verdict.DUPLICATE:
+            self._counters.duplicates += 1
+            self._acknowledge(held, Status.OK)
+        elif verdict is Verdict.GAP:
+            self._counters.gaps += 1
+            self._acknowledge(held, Status.GAP)
+        else:
+            self._counters.refused += 1
+            reason = (
+                f"writer {held.message.writer} of epoch {held.message.epoch} was "
+                f"replaced by a process of epoch {held.state.epoch}; give every actor "
+                "its own number"
+            )
+            self._acknowledge(held, Status.STALE, reason)
+
+    def _drop_superseded(self) -> None:
+        """Lets go of what waited for a writer that has moved on."""
+        while self.ledger.dropped:
+            held = self.ledger.dropped.popleft()
+            end(held.query)
+            held.query = None
+
+    def _acknowledge(self, held: HeldInsert, status: Status, reason: str = "") -> None:
+        """Answers with the writer's next sequence."""
+        if held.query is None:
+            return
+        reply = InsertReply(
+            status=status,
+            writer=held.message.writer,
+            epoch=held.message.epoch,
+            next_sequence=held.state.next_sequence,
+            incarnation=self._incarnation,
+            reason=reason,
+        )
+        answer(held.query, reply.encode(self._spec))
+        held.query = None
+
+    def admit(self) -> bool:
+        """Stores the first waiting batch if it may be; whether it did."""
+        while self._held and self._held[0].query is None:
+            self._held.popleft()
+        if not self._held:
+            return False
+        held = self._held[0]
+        rows, state = held.message.rows, held.state
+        if not self._replay.may_insert(len(rows)):
+            return False
+        self._held.popleft()
+        mark = WriterMark(
+            writer=state.writer,
+            epoch=state.epoch,
+            next_sequence=state.next_sequence + 1,
+            rows=state.rows + len(rows),
+            life=0,
+        )
+        self._replay.insert_bytes(rows, mark)
+        self.ledger.stored(state, len(rows))
+        self._counters.insert_wait_s += time.monotonic() - held.arrived
+        self._acknowledge(held, Status.OK)
+        return True
+
+    def deadlines(self) -> list[float]:
+        """When held batches must be answered, `time.monotonic`."""
+        return [held.deadline for held in self._held]
+
+    def expire(self, now: float) -> None:
+        """Answers "busy" to what has waited as long as it may."""
+        self._tell_fault()
+        for held in [h for h in self._held if h.deadline <= now]:
+            for late in held.state.waiting:
+                if late.query is not None:
+                    self._counters.insert_wait_s += now - late.arrived
+                    self._counters.busy_inserts += 1
+                    self._acknowledge(late, Status.BUSY, self._replay.fault)
+            held.state.waiting.clear()
+        if any(h.query is None for h in self._held):
+            self._held = deque(h for h in self._held if h.query is not None)
+
+    def _tell_fault(self) -> None:
+        """Says once that inserts stop and why, and once that they go on."""
+        fault = self._replay.fault
+        if fault != self._told:
+            self._told = fault
+            print(f"inserts stop: {fault}" if fault else "inserts go on", flush=True)
+
+    def let_go(self) -> None:
+        """Ends all held queries without an answer: their senders try again."""
+        for held in self._held:
+            end(held.query)
