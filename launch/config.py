@@ -145,7 +145,7 @@ def quick() -> ExperimentConfig:
 
 def paper() -> ExperimentConfig:
     """The paper's DQN; it gives the width of 128, the other sizes are ours."""
-    return ExperimentConfig(network=paper_network())
+    return ExperimentConfig(network=paper_network(), replay=ReplayConfig(durable=True))
 
 
 PRESETS: Final = {"quick": quick, "paper": paper}
@@ -224,3 +224,9 @@ def with_environments(config: ExperimentConfig, count: int) -> ExperimentConfig:
     watched = min(config.actor.watched, count)
     actor = dataclasses.replace(config.actor, environments=count, watched=watched)
     return dataclasses.replace(config, actor=actor)
+
+
+def with_durable_replay(config: ExperimentConfig) -> ExperimentConfig:
+    """The same run with its replay kept in files."""
+    replay = dataclasses.replace(config.replay, durable=True)
+    return dataclasses.replace(config, replay=replay)

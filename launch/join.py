@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 TRAIN: Final = "train.bank"
 HELD_OUT: Final = "heldout.bank"
 SCENES: Final = "scenes"
+REPLAY: Final = "replay"  # below the run's folder: the rows of a durable replay
 FETCH_S: Final = 20.0  # after which a file that nobody offers is an error
 
 

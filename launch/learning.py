@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, final
@@ -26,7 +26,7 @@ from learner.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoi
 from learner.curves import CurvesWriter
 from learner.learner import Learner, LearnStep, learn
 from replay.channels import StatusPublisher, StatusSubscriber
-from replay.client import ReplayTimeout, Sampler, fetch_stats
+from replay.client import ReplayTimeout, Sampler, fetch_stats, sync_replay
 from replay.spec import Sample
 from replay.weights import WeightsPublisher
 from sim.bank import Bank
@@ -69,10 +69,15 @@ def make_render(bank: Bank, config: ExperimentConfig) -> Render:
     return lambda rows: compiled(bank, columns_of(rows))
 
 
-def checkpoint_extra(config: ExperimentConfig, elapsed_s: float) -> dict[str, Any]:
-    """What is kept beside the weights: enough to act by them, and the time spent."""
+def checkpoint_extra(
+    config: ExperimentConfig, elapsed_s: float, replay: Mapping[str, int]
+) -> dict[str, Any]:
+    """What is kept beside the weights.
+
+    Enough to act by them, the time spent, and what the replay had on the disk.
+    """
     builtins: dict[str, Any] = msgspec.to_builtins(config)
-    return {"config": builtins, "elapsed_s": elapsed_s}
+    return {"config": builtins, "elapsed_s": elapsed_s, "replay": dict(replay)}
 
 
 @dataclass(frozen=True)
@@ -165,14 +170,21 @@ class Reporter:
         progress: Progress,
         tell: Callable[[dict[str, float | int | str]], object],
         outside: Callable[[], dict[str, float]],
+        sync: Callable[[], Mapping[str, int]] = dict,
     ) -> None:
-        """Opens the curves; `outside` gives what others count, for the curves."""
+        """Opens the curves; `outside` gives what others count, for the curves.
+
+        `sync` has the replay written to the disk and gives its counters: it comes
+        before the checkpoint, so that a replay is never behind the checkpoint that a
+        run goes on from.
+        """
         self._learner = learner
         self._config = config
         self._folder = folder
         self._progress = progress
         self._tell = tell
         self._outside = outside
+        self._sync = sync
         report = config.report
         self._curves = CurvesWriter(
             csv_path=folder / CURVES,
@@ -222,7 +234,9 @@ class Reporter:
         save_checkpoint(
             self._folder / CHECKPOINTS,
             learner=self._learner,
-            extra=checkpoint_extra(self._config, self._progress.elapsed_s),
+            extra=checkpoint_extra(
+                self._config, self._progress.elapsed_s, self._sync()
+            ),
             keep=self._config.report.checkpoints,
         )
 
@@ -263,6 +277,7 @@ def learner_role(join: JoinConfig, stop: threading.Event) -> None:
             progress=progress,
             tell=StatusPublisher(place.session, place.keys, "learner").put,
             outside=lambda: actor_rates(statuses.latest()) | _replay_rates(place),
+            sync=lambda: _synced(place),
         )
         publisher = WeightsPublisher(session=place.session, keys=place.keys)
         layout = layout_hash(learner.layout)
@@ -298,6 +313,17 @@ def _sample(sampler: Sampler) -> Sample | None:
         return sampler.sample(_SAMPLE_S)
     except ReplayTimeout:
         return None
+
+
+def _synced(place: Joined) -> dict[str, int]:
+    """What the replay has on the disk; nothing if it does not say so in time."""
+    if not place.run.config.replay.durable:
+        return {}
+    try:
+        stats = sync_replay(place.session, place.keys, timeout=10.0)
+    except ReplayTimeout:
+        return {}
+    return {name: int(stats[name]) for name in ("inserts", "samples", "deletes")}
 
 
 def _replay_rates(place: Joined) -> dict[str, float]:

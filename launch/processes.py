@@ -27,6 +27,16 @@ class ActorRoleConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReplayRoleConfig:
+    """The replay service of a run."""
+
+    join: tyro.conf.OmitArgPrefixes[JoinConfig]
+    """Which run."""
+    durable: bool = False
+    """Keeps the rows in the run's folder, whatever its configuration says."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ViewerRoleConfig:
     """The live viewer of a run."""
 
@@ -52,10 +62,10 @@ def run_role(name: str, parse: Parse) -> int:
 
 
 def _replay(parse: Parse) -> Act:
-    options = parse(JoinConfig)
+    options = parse(ReplayRoleConfig)
     from launch.roles import replay_role
 
-    return lambda stop: replay_role(options, stop)
+    return lambda stop: replay_role(options.join, stop, durable=options.durable)
 
 
 def _actor(parse: Parse) -> Act:

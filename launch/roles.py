@@ -4,6 +4,7 @@ A role ends when its process is asked to or when the run is called off, and says
 it fares about once a second.
 """
 
+import dataclasses
 import threading
 import time
 from collections import deque
@@ -21,7 +22,16 @@ from actors.network import layout_hash, parameter_layout
 from actors.rows import row_spec
 from launch.config import CONFIG, ExperimentConfig, read_run
 from launch.errors import LaunchError
-from launch.join import HELD_OUT, SCENES, TRAIN, JoinConfig, Joined, joined, train_bank
+from launch.join import (
+    HELD_OUT,
+    REPLAY,
+    SCENES,
+    TRAIN,
+    JoinConfig,
+    Joined,
+    joined,
+    train_bank,
+)
 from launch.status import STATUS_S
 from replay.channels import FramePublisher, StatusPublisher
 from replay.client import Writer
@@ -37,8 +47,13 @@ _WAIT_S: Final = 0.5  # between two looks at the reasons to stop
 _FLUSH_S: Final = 0.5  # for the last rows, when the run may be gone already
 
 
-def replay_role(join: JoinConfig, stop: threading.Event) -> None:
-    """Serves the replay, and the run's files to those who have none of it."""
+def replay_role(
+    join: JoinConfig, stop: threading.Event, *, durable: bool = False
+) -> None:
+    """Serves the replay, and the run's files to those who have none of it.
+
+    `durable`: even if the run's configuration does not say so.
+    """
     if not join.listen:
         raise LaunchError("the replay service needs --listen tcp/HOST:PORT")
     if join.run is None:
@@ -51,6 +66,9 @@ def replay_role(join: JoinConfig, stop: threading.Event) -> None:
 
     check_endpoints((*join.listen, *join.connect), join.insecure)
     run = read_run(join.run)
+    replay = run.config.replay
+    if durable:
+        replay = dataclasses.replace(replay, durable=True)
     keys = RunKeys(join.run_id)
     # The port answers before torch is loaded: the other roles start meanwhile.
     with open_session(connect=join.connect, listen=join.listen, router=True) as session:
@@ -66,8 +84,9 @@ def replay_role(join: JoinConfig, stop: threading.Event) -> None:
             session=session,
             keys=keys,
             spec=row_spec(run.config.environment.observation.history),
-            config=run.config.replay,
+            config=replay,
             seed=run.config.seed,
+            folder=join.run / REPLAY / str(keys.shard),
         ).run(stop)
         offered.close()
         control.close()

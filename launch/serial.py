@@ -19,7 +19,7 @@ from actors.network import layout_hash
 from actors.rows import row_spec
 from launch.config import ExperimentConfig, RunFile
 from launch.console import Status, line_of, snapshot
-from launch.join import SCENES, TRAIN
+from launch.join import REPLAY, SCENES, TRAIN
 from launch.learning import Progress, Reporter, make_learner, make_render, resume, spent
 from launch.roles import ActorStatus, acting_config
 from learner.learner import Learner, LearnStep, learn
@@ -31,15 +31,25 @@ from sim.bank import Bank, open_bank
 _LINE_S = 10.0
 
 
-def serial_steps(
-    config: ExperimentConfig, bank: Bank, learner: Learner, status: ActorStatus
-) -> Iterator[tuple[LearnStep, LocalReplay]]:
-    """Updates for ever, actors taking their turns in between."""
-    replay = LocalReplay(
+def serial_replay(config: ExperimentConfig, folder: Path | None = None) -> LocalReplay:
+    """The run's replay: the one in `folder` if it is durable, else an empty one."""
+    return LocalReplay(
         spec=row_spec(config.environment.observation.history),
         config=config.replay,
         seed=config.seed,
+        folder=folder,
     )
+
+
+def serial_steps(
+    config: ExperimentConfig,
+    bank: Bank,
+    learner: Learner,
+    status: ActorStatus,
+    replay: LocalReplay | None = None,
+) -> Iterator[tuple[LearnStep, LocalReplay]]:
+    """Updates for ever, actors taking their turns in between."""
+    replay = replay or serial_replay(config)
     weights: list[Weights] = []
     layout = layout_hash(learner.layout)
     turns: list[Iterator[Tick]] = []
@@ -91,6 +101,7 @@ def run_serial(folder: Path, run: RunFile) -> None:
     config = run.config
     learner = make_learner(config)
     progress = Progress(resume(learner, folder))
+    replay = serial_replay(config, folder / REPLAY / "0")
     status = ActorStatus.begin()
     told: dict[str, float | int | str] = {}
     counters: dict[str, float] = {}
@@ -101,10 +112,11 @@ def run_serial(folder: Path, run: RunFile) -> None:
         progress=progress,
         tell=told.update,
         outside=lambda: status.rates() | counters,
+        sync=lambda: synced(replay),
     )
     bank = open_bank(folder / SCENES / TRAIN).bank
     due = time.monotonic() + _LINE_S
-    for step, replay in serial_steps(config, bank, learner, status):
+    for step, _ in serial_steps(config, bank, learner, status, replay):
         progress.add(step)
         counters["inserts"] = replay.inserts
         counters["samples_per_insert"] = replay.samples_per_insert
@@ -120,3 +132,16 @@ def run_serial(folder: Path, run: RunFile) -> None:
         if spent(config, learner.updates, progress.elapsed_s):
             break
     reporter.close()
+    replay.close()
+
+
+def synced(replay: LocalReplay) -> dict[str, int]:
+    """What a durable replay has on the disk, once it has all of now."""
+    if replay.durable is None:
+        return {}
+    replay.durable.sync()
+    return {
+        "inserts": replay.inserts,
+        "samples": replay.samples,
+        "deletes": replay.table.deletes,
+    }

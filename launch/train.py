@@ -31,6 +31,7 @@ from launch.config import (
     RunFile,
     quick,
     read_run,
+    with_durable_replay,
     with_environments,
 )
 from launch.errors import LaunchError
@@ -58,6 +59,9 @@ class TrainConfig:
     """Environments per actor; the same as --actor.environments."""
     serial: bool = False
     """Runs all roles in this process, in a fixed order: same seed, same losses."""
+    durable: bool = False
+    """Keeps the replay in the run's folder: killed or resumed, it loses no row that was
+    stored; the same as --replay.durable."""
     view: bool = False
     """Shows the run live in the browser."""
     listen: tuple[str, ...] = ()
@@ -82,9 +86,12 @@ def folder_of(options: TrainConfig) -> Path:
 
 def resolved(options: TrainConfig) -> ExperimentConfig:
     """The configuration with the command's short options in it."""
+    config = options.config
+    if options.durable:
+        config = with_durable_replay(config)
     if options.envs is None:
-        return options.config
-    return with_environments(options.config, options.envs)
+        return config
+    return with_environments(config, options.envs)
 
 
 def prepare(options: TrainConfig) -> tuple[Path, RunFile]:
@@ -132,7 +139,10 @@ def _taken_up(folder: Path, options: TrainConfig) -> RunFile:
     run = read_run(folder)
     for name, expected in ((TRAIN, run.train_hash), (HELD_OUT, run.held_out_hash)):
         check_bank(open_bank(folder / SCENES / name), expected)
-    run = dataclasses.replace(run, config=resolved(options))
+    config = resolved(options)
+    if run.config.replay.durable:  # its rows are there to go on with
+        config = with_durable_replay(config)
+    run = dataclasses.replace(run, config=config)
     run.write(folder)
     return run
 

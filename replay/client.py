@@ -33,6 +33,7 @@ __all__ = [
     "Writer",
     "fetch_rows",
     "fetch_stats",
+    "sync_replay",
 ]
 
 _ANSWER_MARGIN_S = 5.0  # between the service's last moment to answer and giving up
@@ -231,6 +232,20 @@ def fetch_stats(
             f"no answer from {keys.stats} within {timeout:g} s; is the replay service "
             "up?"
         )
+    stats: dict[str, Any] = msgspec.to_builtins(decode(payload, StatsReply))
+    return stats
+
+
+def sync_replay(
+    session: zenoh.Session, keys: RunKeys, *, timeout: float = 30.0
+) -> dict[str, Any]:
+    """The service's counters, once every row that they count is on the disk.
+
+    A service that keeps its rows in memory answers at once.
+    """
+    payload = ask(session, keys.sync, timeout_s=timeout)
+    if payload is None:
+        raise ReplayTimeout(f"no answer from {keys.sync} within {timeout:g} s")
     stats: dict[str, Any] = msgspec.to_builtins(decode(payload, StatsReply))
     return stats
 

@@ -365,6 +365,13 @@ class MappedStorage(AbstractStorage):
             self._due = now + self._sync_s
             self._syncer.start(self._snapshot())
 
+    def sync(self) -> None:
+        """Has all of now on the disk, unless that has a fault."""
+        self._syncer.wait()
+        self._asked = True
+        self.tend()
+        self._syncer.wait()
+
     def wait(self) -> None:
         """Until what is on its way to the disk is there."""
         self._syncer.wait()

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import zenoh
@@ -84,13 +85,17 @@ class Service:
 
 @contextlib.contextmanager
 def service(
-    config: ReplayConfig, *, seed: int = 0, spec: RowSpec = SPEC
+    config: ReplayConfig,
+    *,
+    seed: int = 0,
+    spec: RowSpec = SPEC,
+    folder: Path | None = None,
 ) -> Iterator[Service]:
     """A replay service in a thread of this process, over a real TCP link."""
     endpoint = free_endpoint()
     router = open_session(listen=[endpoint], router=True)
     server = ReplayServer(
-        session=router, keys=KEYS, spec=spec, config=config, seed=seed
+        session=router, keys=KEYS, spec=spec, config=config, seed=seed, folder=folder
     )
     stop = threading.Event()
     thread = threading.Thread(target=server.run, args=(stop,))

@@ -125,6 +125,8 @@ SMALL_MESSAGES: list[control.Message] = [
         stale_updates=0,
         pending_samples=0,
         mean_priority_mass=1.0,
+        durable=True,
+        fault="",
         writers=[
             control.WriterStats(writer=1, epoch=2, next_sequence=3, rows=4, pending=5)
         ],
