@@ -1,14 +1,6 @@
 """Rows in mapped files: what was acknowledged survives kill -9 at any instruction.
 
-`state.bin`, which every change goes through:
-
-    0     samples u64, oldest u64, clean u64 (1: closed in order)
-    64    boot id, ASCII[40]
-    512   commit record A        1024  commit record B
-    4096  writers, 64 bytes each: writer, used, epoch, next sequence, rows, life, CRC32
-
-A commit record is (generation, inserts, the entry of the writer of the last batch and
-its place among the writers, CRC32). Commit g goes into place g % 2.
+Every change goes through `state.bin`, whose layout is in `replay.records`.
 
 The argument. A process that is killed leaves in the mapped files a prefix of its stores
 in program order: the kernel keeps the pages, and one thread makes all stores. An insert
@@ -40,11 +32,8 @@ in order) pages are on the disk in any order, and the last snapshot is recovered
 up to `reserve` of the oldest rows of a full ring.
 """
 
-import abc
 import os
-import struct
 import time
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import final
@@ -67,6 +56,27 @@ from replay.folder import (
     open_files,
     write_meta,
 )
+from replay.records import (
+    BOOT,
+    BOOT_BYTES,
+    CLEAN,
+    COMMIT_BYTES,
+    COMMITS,
+    EMPTY,
+    ENTRIES,
+    ENTRY_BYTES,
+    MAX_WRITERS,
+    NO_PLACE,
+    OLDEST,
+    SAMPLES,
+    AbstractStores,
+    FileStores,
+    boot_id,
+    decode_commit,
+    decode_entry,
+    encode_commit,
+    encode_entry,
+)
 from replay.spec import RowSpec
 from replay.storage import AbstractStorage, StorageState, WriterMark
 from replay.syncing import (
@@ -76,94 +86,6 @@ from replay.syncing import (
     newest_snapshot,
     write_snapshot,
 )
-
-MAX_WRITERS = 16_384
-_SAMPLES, _OLDEST, _CLEAN, _BOOT, _BOOT_BYTES = 0, 8, 16, 64, 40
-_COMMITS = (512, 1024)
-_ENTRIES = 4096
-_ENTRY_BYTES = 64
-_ENTRY = struct.Struct("<IIQQQQ")
-_COMMIT = struct.Struct("<QQII")
-_CRC = struct.Struct("<I")
-_NO_PLACE = 0xFFFFFFFF
-_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-
-
-class AbstractStores(abc.ABC):
-    """The stores that recovery relies on; tests stop them half-way."""
-
-    @abc.abstractmethod
-    def put(self, name: str, offset: int, data: bytes | memoryview) -> None:
-        """Copies bytes into a file; a stop may leave a part of them."""
-
-    @abc.abstractmethod
-    def put64(self, name: str, offset: int, value: int) -> None:
-        """One aligned 8-byte store; a stop leaves the old value or the new."""
-
-
-@final
-class FileStores(AbstractStores):
-    """Stores into the mapped files."""
-
-    def __init__(self, files: Mapping[str, MappedFile]) -> None:
-        """All files by name."""
-        self._maps = {name: file.map for name, file in files.items()}
-        self._cells = np.frombuffer(self._maps[STATE], "<u8", _BOOT // 8)
-
-    def put(self, name: str, offset: int, data: bytes | memoryview) -> None:
-        """See the base class."""
-        self._maps[name][offset : offset + len(data)] = data
-
-    def put64(self, name: str, offset: int, value: int) -> None:
-        """See the base class."""
-        assert name == STATE
-        self._cells[offset // 8] = value
-
-
-def _entry(mark: WriterMark) -> bytes:
-    """A writer's entry, with its checksum."""
-    body = _ENTRY.pack(
-        mark.writer, 1, mark.epoch, mark.next_sequence, mark.rows, mark.life
-    )
-    return (body + _CRC.pack(zlib.crc32(body))).ljust(_ENTRY_BYTES, b"\0")
-
-
-_EMPTY = bytes(_ENTRY_BYTES)
-
-
-def _mark(entry: bytes) -> WriterMark | None:
-    """The writer of an entry; None if it is not whole."""
-    writer, used, epoch, sequence, rows, life = _ENTRY.unpack_from(entry)
-    (crc,) = _CRC.unpack_from(entry, _ENTRY.size)
-    if used != 1 or crc != zlib.crc32(entry[: _ENTRY.size]):
-        return None
-    return WriterMark(
-        writer=writer, epoch=epoch, next_sequence=sequence, rows=rows, life=life
-    )
-
-
-def _commit_record(generation: int, inserts: int, place: int, entry: bytes) -> bytes:
-    body = _COMMIT.pack(generation, inserts, place, 0) + entry
-    return body + _CRC.pack(zlib.crc32(body))
-
-
-_COMMIT_BYTES = _COMMIT.size + _ENTRY_BYTES + _CRC.size
-
-
-def _read_commit(record: bytes) -> tuple[int, int, int, bytes] | None:
-    """(generation, inserts, place, entry) of a whole record."""
-    body, (crc,) = record[: -_CRC.size], _CRC.unpack(record[-_CRC.size :])
-    generation, inserts, place, _ = _COMMIT.unpack_from(body)
-    if generation == 0 or crc != zlib.crc32(body):
-        return None
-    return generation, inserts, place, body[_COMMIT.size :]
-
-
-def _boot_id() -> bytes:
-    try:
-        return _BOOT_ID.read_bytes().strip()[:_BOOT_BYTES].ljust(_BOOT_BYTES, b"\0")
-    except OSError:
-        return bytes(_BOOT_BYTES)
 
 
 @final
@@ -222,26 +144,26 @@ class MappedStorage(AbstractStorage):
         return int.from_bytes(self._state(offset, 8), "little")
 
     def _came_by_power_loss(self) -> bool:
-        same = self._state(_BOOT, _BOOT_BYTES) == _boot_id()
-        return not same and self._cell(_CLEAN) == 0
+        same = self._state(BOOT, BOOT_BYTES) == boot_id()
+        return not same and self._cell(CLEAN) == 0
 
     def _restore(self, snapshot: Snapshot) -> None:
         """Makes the state that of the snapshot; can be repeated if it is stopped."""
         # Their slots may hold newer rows, or parts of them.
         given_up = snapshot.reserved - self.capacity
         oldest = max(snapshot.oldest, min(given_up, snapshot.inserts))
-        for place in _COMMITS:
-            self._stores.put(STATE, place, bytes(_COMMIT_BYTES))
-        empty = bytes(MAX_WRITERS * _ENTRY_BYTES - len(snapshot.entries))
-        self._stores.put(STATE, _ENTRIES, snapshot.entries + empty)
-        self._stores.put64(STATE, _SAMPLES, snapshot.samples)
-        self._stores.put64(STATE, _OLDEST, oldest)
-        record = _commit_record(1, snapshot.inserts, _NO_PLACE, _EMPTY)
-        self._stores.put(STATE, _COMMITS[1], record)
+        for place in COMMITS:
+            self._stores.put(STATE, place, bytes(COMMIT_BYTES))
+        empty = bytes(MAX_WRITERS * ENTRY_BYTES - len(snapshot.entries))
+        self._stores.put(STATE, ENTRIES, snapshot.entries + empty)
+        self._stores.put64(STATE, SAMPLES, snapshot.samples)
+        self._stores.put64(STATE, OLDEST, oldest)
+        record = encode_commit(1, snapshot.inserts, NO_PLACE, EMPTY)
+        self._stores.put(STATE, COMMITS[1], record)
 
     def _recover(self) -> StorageState:
         """The newest whole commit, and its writer's entry written again."""
-        found = [_read_commit(self._state(p, _COMMIT_BYTES)) for p in _COMMITS]
+        found = [decode_commit(self._state(p, COMMIT_BYTES)) for p in COMMITS]
         whole = [record for record in found if record is not None]
         if not whole:
             raise FolderError(
@@ -249,14 +171,14 @@ class MappedStorage(AbstractStorage):
                 "file, or choose another folder"
             )
         self._generation, inserts, place, entry = max(whole)
-        if place != _NO_PLACE:
-            self._stores.put(STATE, _ENTRIES + place * _ENTRY_BYTES, entry)
+        if place != NO_PLACE:
+            self._stores.put(STATE, ENTRIES + place * ENTRY_BYTES, entry)
         marks = []
         for place in range(MAX_WRITERS):
-            entry = self._state(_ENTRIES + place * _ENTRY_BYTES, _ENTRY_BYTES)
-            if entry == _EMPTY:
+            entry = self._state(ENTRIES + place * ENTRY_BYTES, ENTRY_BYTES)
+            if entry == EMPTY:
                 break
-            mark = _mark(entry)
+            mark = decode_entry(entry)
             if mark is None:
                 raise FolderError(
                     f"{self._files[STATE].path}: damaged: writer {place} is not whole; "
@@ -265,18 +187,18 @@ class MappedStorage(AbstractStorage):
             self._places[mark.writer] = place
             marks.append(mark)
         # A stop in the middle of an insert may have pushed rows out for nothing.
-        oldest = max(self._cell(_OLDEST), inserts - self.capacity)
+        oldest = max(self._cell(OLDEST), inserts - self.capacity)
         return StorageState(
             inserts=inserts,
             oldest=min(oldest, inserts),
-            samples=self._cell(_SAMPLES),
+            samples=self._cell(SAMPLES),
             writers=tuple(marks),
         )
 
     def _open_for_changes(self) -> None:
         """From here on the folder is not one that was closed in order."""
-        self._stores.put(STATE, _BOOT, _boot_id())
-        self._stores.put64(STATE, _CLEAN, 0)
+        self._stores.put(STATE, BOOT, boot_id())
+        self._stores.put64(STATE, CLEAN, 0)
         # On the disk before any row is: or a power loss would take the rows that are
         # written next for those that were there at the orderly end.
         self._files[STATE].sync()
@@ -300,7 +222,7 @@ class MappedStorage(AbstractStorage):
     def evict(self, oldest: int) -> None:
         """Step 1."""
         self._oldest = oldest
-        self._stores.put64(STATE, _OLDEST, oldest)
+        self._stores.put64(STATE, OLDEST, oldest)
 
     def write_rows(self, slot: int, rows: UInt8[np.ndarray, "rows row_bytes"]) -> None:
         """Step 2."""
@@ -309,26 +231,26 @@ class MappedStorage(AbstractStorage):
 
     def commit(self, inserts: int, mark: WriterMark | None) -> None:
         """Steps 3 and 4."""
-        place, entry = _NO_PLACE, _EMPTY
+        place, entry = NO_PLACE, EMPTY
         if mark is not None:
             place = self._places.get(mark.writer, len(self._places))
             if place >= MAX_WRITERS:
                 raise FolderError(
                     f"writer {mark.writer}: a replay service has at most {MAX_WRITERS}"
                 )
-            entry = _entry(mark)
+            entry = encode_entry(mark)
         generation = self._generation + 1
-        record = _commit_record(generation, inserts, place, entry)
-        self._stores.put(STATE, _COMMITS[generation % 2], record)
+        record = encode_commit(generation, inserts, place, entry)
+        self._stores.put(STATE, COMMITS[generation % 2], record)
         self._generation, self._inserts = generation, inserts
         if mark is not None:
-            self._stores.put(STATE, _ENTRIES + place * _ENTRY_BYTES, entry)
+            self._stores.put(STATE, ENTRIES + place * ENTRY_BYTES, entry)
             self._places[mark.writer] = place
 
     def count_samples(self, samples: int) -> None:
         """See the base class."""
         self._samples = samples
-        self._stores.put64(STATE, _SAMPLES, samples)
+        self._stores.put64(STATE, SAMPLES, samples)
 
     # Snapshots
 
@@ -384,7 +306,7 @@ class MappedStorage(AbstractStorage):
             oldest=self._oldest,
             samples=self._samples,
             reserved=self._inserts + self._reserve,
-            entries=self._state(_ENTRIES, len(self._places) * _ENTRY_BYTES),
+            entries=self._state(ENTRIES, len(self._places) * ENTRY_BYTES),
         )
         return self._last
 
@@ -395,7 +317,7 @@ class MappedStorage(AbstractStorage):
         self._syncer.wait()
         self._syncer.close()
         if not self._syncer.error:
-            self._stores.put64(STATE, _CLEAN, 1)
+            self._stores.put64(STATE, CLEAN, 1)
             self._files[STATE].sync()
         for file in self._files.values():
             file.close()
@@ -420,8 +342,8 @@ def open_storage(
         sizes = {
             ROWS: capacity * spec.row_bytes,
             PRIORITIES: capacity * 8,
-            STATE: _ENTRIES + MAX_WRITERS * _ENTRY_BYTES,
-            SYNC: 2 * (HEAD_BYTES + MAX_WRITERS * _ENTRY_BYTES),
+            STATE: ENTRIES + MAX_WRITERS * ENTRY_BYTES,
+            SYNC: 2 * (HEAD_BYTES + MAX_WRITERS * ENTRY_BYTES),
         }
         if count_draws:
             sizes[TIMES] = capacity * 4
@@ -451,8 +373,8 @@ def _begin(
     stores: AbstractStores,
 ) -> None:
     """Commit 1 and snapshot 1 of an empty replay; then the folder is complete."""
-    stores.put(STATE, _COMMITS[1], _commit_record(1, 0, _NO_PLACE, _EMPTY))
-    stores.put(STATE, _BOOT, _boot_id())
+    stores.put(STATE, COMMITS[1], encode_commit(1, 0, NO_PLACE, EMPTY))
+    stores.put(STATE, BOOT, boot_id())
     first = Snapshot(number=1, inserts=0, oldest=0, samples=0, reserved=0, entries=b"")
     others = [file for name, file in files.items() if name != SYNC]
     write_snapshot(first, files[SYNC], others)

@@ -11,7 +11,8 @@ import numpy as np
 
 from replay.folder import MappedFile
 from replay.local import ReplayConfig
-from replay.mapped import AbstractStores, FileStores, MappedStorage, open_storage
+from replay.mapped import MappedStorage, open_storage
+from replay.records import AbstractStores, FileStores
 from replay.spec import Field, RowSpec
 
 CHECKED = RowSpec(

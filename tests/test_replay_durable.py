@@ -10,6 +10,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from replay import mapped
+from replay.folder import SYNC
 from replay.local import LocalReplay, ReplayConfig
 from replay.mapped import MappedStorage
 from replay.spec import ReplayError
@@ -199,14 +200,14 @@ def lose_power(folder: Path, chance: random.Random, before: int, after: int) -> 
     now = {name: bytes(file.map) for name, file in storage._files.items()}
     kill(storage)
     for name, old in disk.items():
-        if name != mapped.SYNC:
+        if name != SYNC:
             pages = range(0, len(old), 4096)
             old = b"".join(
                 chance.choice((old, now[name]))[page : page + 4096] for page in pages
             )
         (folder / name).write_bytes(old)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mapped, "_boot_id", lambda: b"another".ljust(40, b"\0"))
+        patch.setattr(mapped, "boot_id", lambda: b"another".ljust(40, b"\0"))
         storage = open_here(folder, spec=SPEC, capacity=capacity)
     assert storage.power_lost
     state = storage.state
