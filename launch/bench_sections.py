@@ -9,7 +9,7 @@ from launch import bench_bicycle, bench_table6
 from launch.bench_scenes import Source
 from launch.bench_table6 import Work
 from launch.bench_timing import yardsticks
-from launch.scenes import say
+from launch.converting import say
 
 Request = Mapping[str, Any]
 

@@ -4,10 +4,11 @@ A bank is used as it is; files and folders of scenes are converted; `procedural`
 generated. What a folder holds besides scenes is passed over with a word.
 """
 
+import dataclasses
 import json
-import sys
+import shutil
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,72 +19,74 @@ from rich.console import Console
 from rich.table import Table
 
 from launch.config import ScenesConfig
+from launch.converting import Places, Tally, gathering, processors, say
 from launch.errors import LaunchError
-from sim.bank import BankFile, is_bank, open_bank
-from sim.bank_writer import write_bank
+from sim.bank import BankFile, is_bank, open_bank, verify
+from sim.conversion import Conversion, work_folder
 from sim.formats import list_files, read_scenes
-from sim.procedural import generate_many
+from sim.parts import Part
+from sim.places import places_in, procedural_places
 from sim.scene import Scene
 
 PROCEDURAL: Final = "procedural"
 HELD_OUT_SEED: Final = 1_000_003  # added to the seed of the training scenes
+INCOMPLETE: Final = 1  # exit code: there is a bank, but not of all that was named
+SHOWN: Final = 50  # scenes in a table
 
 
-def say(line: str) -> None:
-    """For a person; standard output is kept for results."""
-    print(line, file=sys.stderr, flush=True)
-
-
-def _counted(scenes: Iterable[Scene], path: Path) -> None:
-    """Writes a bank and says how far it is."""
-    console = Console(stderr=True)
-    with ExitStack() as stack:
-        status = None
-        if console.is_terminal:
-            status = stack.enter_context(console.status(f"{path.name}: ..."))
-
-        def progress(count: int) -> None:
-            if status is not None:
-                status.update(f"{path.name}: {count} scenes")
-
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bank(scenes, path, progress=progress)
-
-
-def write_procedural(path: Path, *, count: int, seed: int) -> BankFile:
-    """Generates scenes into a bank."""
+def write_procedural(
+    path: Path, *, count: int, seed: int, keep: bool = False
+) -> BankFile:
+    """Generates scenes into a bank; `keep` as in `gathering`."""
     if count < 1 or seed < 0:
         raise LaunchError(
             f"count {count} must be at least 1 and seed {seed} at least 0"
         )
-    _counted(generate_many(seed, count), path)
+    _write(path, lambda: procedural_places(seed, count), _Options(), keep=keep)
     return open_bank(path)
 
 
-def write_recorded(path: Path, sources: Sequence[Path]) -> BankFile:
-    """Converts recorded scenes into a bank."""
-    _counted(_recorded(sources), path)
-    return open_bank(path)
+@dataclass(frozen=True, kw_only=True)
+class _Options:
+    """How to convert."""
+
+    slots: int = 0
+    workers: int = 0  # 0: one for each processor
+    dt: float | None = None
 
 
-def _recorded(sources: Sequence[Path]) -> list[Scene]:
-    """All scenes of files and folders; no two of one id."""
-    scenes = list(read_scenes(sources, on_skip=lambda why: say(f"passed over: {why}")))
-    if not scenes:
-        raise LaunchError(
-            f"{sources[0]}: holds no scene; name a file or folder of them"
-        )
-    unique = {scene.scenario_id: scene for scene in reversed(scenes)}
-    return [scene for scene in scenes if unique.get(scene.scenario_id) is scene]
+def _write(path: Path, places: Places, options: _Options, *, keep: bool) -> Tally:
+    """Converts scenes into a bank; work files are beside it meanwhile."""
+    if path.exists() and not is_bank(path):
+        raise LaunchError(f"{path}: exists and is no bank; choose another --out")
+    folder = work_folder(path)
+    with gathering(folder, keep=keep) as gathered:
+        gathered.gather(places, _conversion(folder, options), options.dt)
+        gathered.write(path, gathered.parts)
+    return gathered.tally
 
 
-def split(scenes: Sequence[Scene], share: float) -> tuple[list[Scene], list[Scene]]:
+def _conversion(folder: Path, options: _Options) -> Conversion:
+    return Conversion(
+        folder=folder,
+        slots=options.slots,
+        workers=options.workers or processors(),
+    )
+
+
+def _recorded(sources: Sequence[Path]) -> Places:
+    """The records of files and folders."""
+    files = list_files(sources, on_skip=lambda why: say(f"passed over: {why}"))
+    return lambda: places_in(files)
+
+
+def split(parts: Sequence[Part], share: float) -> tuple[list[Part], list[Part]]:
     """To train on and to hold out: the last ones; of a single scene, both are it."""
-    if len(scenes) == 1:
+    if len(parts) == 1:
         say("one scene only: it is trained on and evaluated on")
-        return list(scenes), list(scenes)
-    kept = min(max(1, round(len(scenes) * share)), len(scenes) - 1)
-    return list(scenes[:-kept]), list(scenes[-kept:])
+        return list(parts), list(parts)
+    kept = min(max(1, round(len(parts) * share)), len(parts) - 1)
+    return list(parts[:-kept]), list(parts[-kept:])
 
 
 def prepare_banks(
@@ -100,10 +103,19 @@ def prepare_banks(
     banks = [path for path in paths if path.is_file() and is_bank(path)]
     if banks:
         return _given(banks, paths, train, held_out)
-    ours, theirs = split(_recorded(paths), config.held_out_share)
-    _counted(ours, train)
-    _counted(theirs, held_out)
+    places, folder = _recorded(paths), work_folder(train)
+    with gathering(folder, keep=False) as gathered:
+        gathered.gather(places, _conversion(folder, _Options()))
+        ours, theirs = split(gathered.parts, config.held_out_share)
+        gathered.write(train, ours)
+        gathered.write(held_out, theirs)
+    _tell_left_out(gathered.tally)
     return open_bank(train), open_bank(held_out)
+
+
+def _tell_left_out(tally: Tally) -> None:
+    if tally.settled > tally.scenes:
+        say(f"{tally.scenes} scenes{tally.words()}")
 
 
 def _given(
@@ -118,8 +130,8 @@ def _given(
     for path in banks:
         open_bank(path)
     train.parent.mkdir(parents=True, exist_ok=True)
-    train.write_bytes(banks[0].read_bytes())
-    held_out.write_bytes(banks[-1].read_bytes())
+    shutil.copyfile(banks[0], train)
+    shutil.copyfile(banks[-1], held_out)
     return open_bank(train), open_bank(held_out)
 
 
@@ -134,7 +146,8 @@ def bank_of(
     if tuple(sources) == (PROCEDURAL,):
         seed = config.seed + HELD_OUT_SEED
         return write_procedural(folder / "a.bank", count=config.held_out, seed=seed)
-    return write_recorded(folder / "a.bank", paths)
+    _tell_left_out(_write(folder / "a.bank", _recorded(paths), _Options(), keep=False))
+    return open_bank(folder / "a.bank")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,15 +157,36 @@ class ConvertConfig:
     sources: tyro.conf.Positional[tuple[Path, ...]]
     """Files or folders; formats are told by content."""
     out: Path
-    """The bank to write."""
+    """The bank to write. Work files lie beside it in OUT.parts meanwhile."""
+    slots: int = 0
+    """Objects a scene keeps at most: the recording vehicle, tracks to predict, then
+    those that come nearest to it; 0 keeps all."""
+    dt: float | None = None
+    """Step length [s] of the scenes to take; left out: the first scene's."""
+    workers: int = 0
+    """Processes that convert; 0: one for each processor."""
+    json: bool = False
+    """Prints the summary as JSON."""
 
 
 def convert_command(options: ConvertConfig) -> int:
-    """`slipstream scenes convert`."""
+    """`slipstream scenes convert`: 0, or 1 if the bank lacks scenes that were named."""
     if not options.sources:
         raise LaunchError("slipstream scenes convert: name files or folders of scenes")
-    _tell_bank(write_recorded(options.out, options.sources))
-    return 0
+    if options.slots < 0 or options.workers < 0:
+        raise LaunchError(
+            f"--slots {options.slots} and --workers {options.workers} must be 0 or more"
+        )
+    how = _Options(slots=options.slots, workers=options.workers, dt=options.dt)
+    tally = _write(options.out, _recorded(options.sources), how, keep=True)
+    bank = open_bank(options.out)
+    size = bank.path.stat().st_size
+    if options.json:
+        known = {"bank": str(bank.path), "bytes": size, "dt": bank.dt}
+        print(json.dumps(known | dataclasses.asdict(tally), indent=1))
+    else:
+        _tell_bank(bank, tally.words())
+    return 0 if tally.complete else INCOMPLETE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,14 +203,16 @@ class ProceduralConfig:
 
 def procedural_command(options: ProceduralConfig) -> int:
     """`slipstream scenes procedural`."""
-    bank = write_procedural(options.out, count=options.count, seed=options.seed)
+    bank = write_procedural(
+        options.out, count=options.count, seed=options.seed, keep=True
+    )
     _tell_bank(bank)
     return 0
 
 
-def _tell_bank(bank: BankFile) -> None:
+def _tell_bank(bank: BankFile, words: str = "") -> None:
     size = bank.path.stat().st_size / 1e6
-    print(f"{bank.path}: {bank.scenes} scenes, {size:.1f} MB")
+    print(f"{bank.path}: {bank.scenes} scenes, {size:.1f} MB{words}")
 
 
 def _scene_info(scene: Scene) -> dict[str, Any]:
@@ -191,6 +227,7 @@ def _scene_info(scene: Scene) -> dict[str, Any]:
         "current_step": scene.current_step,
         "dt": scene.dt,
         "lights": len(scene.lights.lane_ids),
+        "dropped": 0,
         "roads": kinds,
     }
 
@@ -206,6 +243,7 @@ def _bank_info(bank: BankFile) -> list[dict[str, Any]]:
             "current_step": int(arrays["current_step"][row]),
             "dt": bank.dt,
             "lights": int(arrays["lights"][row]),
+            "dropped": bank.header.dropped[row],
         }
         for row, name in enumerate(bank.scenario_ids)
     ]
@@ -219,6 +257,8 @@ class InfoConfig:
     """A bank, a file or a folder of scenes."""
     json: bool = False
     """Prints JSON and no table."""
+    verify: bool = False
+    """Reads all of a bank and compares its hash."""
 
 
 def info_command(options: InfoConfig) -> int:
@@ -227,19 +267,39 @@ def info_command(options: InfoConfig) -> int:
     content: dict[str, Any] = {"source": str(source)}
     if source.is_file() and is_bank(source):
         bank = open_bank(source)
+        if options.verify:
+            verify(bank)
         content |= {"hash": bank.content_hash, "bytes": source.stat().st_size}
+        content |= {"verified": options.verify, "dropped": sum(bank.header.dropped)}
         content["scenes"] = _bank_info(bank)
     else:
         content["files"] = [str(path) for path in list_files([source])]
         content["scenes"] = [_scene_info(scene) for scene in read_scenes([source])]
     if options.json:
         print(json.dumps(content, indent=1))
-        return 0
-    table = Table(title=str(source))
-    columns = ("id", "objects", "steps", "valid", "current_step", "dt", "lights")
+    else:
+        _show(content)
+    return 0
+
+
+def _show(content: dict[str, Any]) -> None:
+    """The first scenes as a table, and what is said of all of them."""
+    scenes = content["scenes"]
+    table = Table(title=f"{content['source']}: {len(scenes)} scenes")
+    columns = ["id", "objects", "steps", "valid", "current_step", "dt", "lights"]
+    columns.append("dropped")
     for name in columns:
         table.add_column(name)
-    for scene in content["scenes"]:
+    for scene in scenes[:SHOWN]:
         table.add_row(*(str(scene[name]) for name in columns))
-    Console().print(table)
-    return 0
+    console = Console()
+    console.print(table)
+    if len(scenes) > SHOWN:
+        console.print(f"and {len(scenes) - SHOWN} more; --json has them all")
+    if "hash" in content:
+        checked = "verified" if content["verified"] else "not verified: --verify"
+        console.print(
+            f"{content['bytes'] / 1e6:.1f} MB, {content['dropped']} objects dropped, "
+            f"hash {content['hash'][:16]} ({checked})",
+            highlight=False,
+        )

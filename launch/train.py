@@ -34,9 +34,10 @@ from launch.config import (
     with_durable_replay,
     with_environments,
 )
+from launch.converting import say
 from launch.errors import LaunchError
 from launch.join import HELD_OUT, SCENES, TRAIN, check_bank
-from launch.scenes import PROCEDURAL, prepare_banks, say
+from launch.scenes import PROCEDURAL, prepare_banks
 from launch.supervisor import Outcome, Result, Role, Supervisor
 from sim.bank import open_bank
 
