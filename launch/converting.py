@@ -246,6 +246,10 @@ def gathering(folder: Path, *, keep: bool) -> Iterator[Gathered]:
         gathered = Gathered(_Shown(shown, folder.name.removesuffix(".parts")), folder)
         try:
             yield gathered
+        except LaunchError:
+            if not gathered.parts:  # there is nothing to go on from
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
         except KeyboardInterrupt:
             if keep and gathered.tally.settled:
                 tally = gathered.tally
