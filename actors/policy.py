@@ -1,4 +1,4 @@
-"""The trained policy: read from a checkpoint without torch, acting greedily."""
+"""The trained policy: read from a checkpoint without torch, and driving by it."""
 
 import json
 import zipfile
@@ -13,22 +13,17 @@ import msgspec
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from actors.cloning import cloned
+from actors.mixture import Choice, policy_outputs
 from actors.network import (
     NetworkConfig,
-    batched,
     layout_hash,
     parameter_count,
     parameter_layout,
 )
-from sim.agents import Agent, Decision, discrete
-from sim.bank import Bank
-from sim.environment import EnvironmentConfig, State
-from sim.observation import (
-    Observation,
-    ObservationSizes,
-    observation_sizes,
-    observe_batch,
-)
+from sim.agents import Agent
+from sim.environment import EnvironmentConfig
+from sim.observation import ObservationSizes, observation_sizes
 
 POLICY = "policy.npz"
 LATEST = "latest"
@@ -45,17 +40,19 @@ class Policy:
     vector: Float[np.ndarray, " parameters"]
     network: NetworkConfig
     sizes: ObservationSizes
-    actions: int
+    actions: int  # outputs of the network
     extra: dict[str, Any]  # what the run put beside it, its configuration
+    mixture: int = 0  # components that the outputs are; 0: one output for each action
 
     def check(self, environment: EnvironmentConfig, where: Path) -> None:
         """Refuses an environment that this policy does not fit."""
         sizes = observation_sizes(environment.observation)
-        if (self.sizes, self.actions) != (sizes, environment.action.count):
+        outputs = policy_outputs(environment.action, self.mixture)
+        if (self.sizes, self.actions) != (sizes, outputs):
             raise PolicyError(
                 f"checkpoint {where} is of another network: it reads "
-                f"{self.sizes} and has {self.actions} actions, the environment gives "
-                f"{sizes} and {environment.action.count}; use the run's own config.json"
+                f"{self.sizes} and has {self.actions} outputs, the environment gives "
+                f"{sizes} and {outputs}; use the run's own config.json"
             )
 
 
@@ -102,6 +99,7 @@ def read_policy(path: Path) -> Policy:
                 sizes=ObservationSizes(**_whole_numbers(arrays["sizes"])),
                 actions=int(arrays["actions"]),
                 extra=json.loads(str(arrays["extra"])),
+                mixture=int(arrays["mixture"]) if "mixture" in arrays else 0,
             )
     except _UNREADABLE as error:
         reason = str(error).partition("\n")[0] or type(error).__name__
@@ -150,21 +148,20 @@ def greedy(
     config: EnvironmentConfig,
 ) -> Agent:
     """Takes the action of the highest Q-value for every controlled object."""
-    sizes = observation_sizes(config.observation)
-    actions = config.action.count
+    return cloned(vector, network, config, components=0)
 
-    def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
-        one = jax.tree.map(lambda value: value[None], state.view)
-        observation: Observation = jax.tree.map(
-            lambda values: values[0], observe_batch(bank, one, config.observation)
-        )
-        q_values = batched(
-            vector, observation, config=network, sizes=sizes, actions=actions
-        )
-        action = jnp.argmax(q_values, -1).astype(jnp.int32)
-        return discrete(state, action, q_values, config)
 
-    return act
+def policy_agent(
+    policy: Policy, config: EnvironmentConfig, choice: Choice = "mode"
+) -> Agent:
+    """Drives by a policy, whatever it was trained by; Q-values greedily by default."""
+    return cloned(
+        jnp.asarray(policy.vector),
+        policy.network,
+        config,
+        components=policy.mixture,
+        choice=choice,
+    )
 
 
 def random_vector(

@@ -19,8 +19,12 @@ from sim.observation import Observation, ObservationConfig, observe_batch
 from sim.world import View
 
 
-def row_spec(history: int) -> RowSpec:
-    """The layout of a row for `history` states per observation."""
+def row_spec(history: int, components: int = 0) -> RowSpec:
+    """The layout of a row for `history` states per observation.
+
+    With `components`, rows hold an expert's continuous action of as many, too.
+    """
+    expert = (Field("continuous", "f4", (components,)),) if components else ()
     return RowSpec(
         (
             Field("scene", "i4"),
@@ -29,6 +33,7 @@ def row_spec(history: int) -> RowSpec:
             Field("states", "f4", (history + 1, 5)),  # x, y, yaw, v_x, v_y
             Field("valid", "u1", (history + 1,)),
             Field("action", "i4"),  # a_tm1, index into the action table
+            *expert,  # the same in its own units, see `actors.cloning`
             Field("reward", "f4"),  # r_t
             Field("discount", "f4"),  # 1, or 0 if and only if s_t is terminal
             Field("weights_version", "i8"),  # of the policy that acted
@@ -67,22 +72,32 @@ def render(
     Bit for bit those that the actor acted on: `observe_batch` is the same program
     whatever surrounds it (tested).
     """
-    states, valid = jnp.asarray(columns.states), jnp.asarray(columns.valid)
-    before = View(
-        scene=jnp.asarray(columns.scene),
-        step=jnp.asarray(columns.step) - 1,
-        controlled=jnp.asarray(columns.controlled)[:, None],
-        history=states[:, None, :-1],
-        history_valid=valid[:, None, :-1],
-    )
-    after = before._replace(
-        step=jnp.asarray(columns.step),
-        history=states[:, None, 1:],
-        history_valid=valid[:, None, 1:],
-    )
+    before, after = _view(columns, 1), _view(columns, 0)
     both = jax.tree.map(lambda *parts: jnp.concatenate(parts), before, after)
     seen = observe_batch(bank, both, config)
     batch = columns.scene.shape[0]
     first = jax.tree.map(lambda values: values[:batch, 0], seen)
     second = jax.tree.map(lambda values: values[batch:, 0], seen)
     return first, second
+
+
+def render_before(
+    bank: Bank, columns: Columns, config: ObservationConfig
+) -> Observation:
+    """The observations s_tm1 alone, where the action was chosen."""
+    seen = observe_batch(bank, _view(columns, 1), config)
+    return jax.tree.map(lambda values: values[:, 0], seen)
+
+
+def _view(columns: Columns, ago: int) -> View:
+    """What is observed of each row, `ago` steps before its last state."""
+    states, valid = jnp.asarray(columns.states), jnp.asarray(columns.valid)
+    history = states.shape[1] - 1
+    first = 1 - ago
+    return View(
+        scene=jnp.asarray(columns.scene),
+        step=jnp.asarray(columns.step) - ago,
+        controlled=jnp.asarray(columns.controlled)[:, None],
+        history=states[:, None, first : first + history],
+        history_valid=valid[:, None, first : first + history],
+    )

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import jax
-import jax.numpy as jnp
 import msgspec
 import numpy as np
 from rich.console import Console
@@ -24,7 +23,7 @@ from rich.table import Table
 
 from actors.evaluation import Evaluation, evaluate
 from actors.frames import FrameBatch
-from actors.policy import greedy, random_vector, read_policy
+from actors.policy import greedy, policy_agent, random_vector, read_policy
 from launch.config import ExperimentConfig, ScenesConfig, quick, write_atomically
 from launch.errors import LaunchError
 from launch.scenes import bank_of
@@ -146,8 +145,7 @@ def driver_of(name: str) -> Driver:
             "that `slipstream train` wrote"
         ) from error
     policy.check(config.environment, path)
-    vector = jnp.array(policy.vector)
-    agent = greedy(vector, policy.network, config.environment)
+    agent = policy_agent(policy, config.environment)
     return Driver(str(path), agent, config.environment)
 
 
@@ -217,7 +215,7 @@ def compare(
     weights_key, key = jax.random.split(key)
     untrained = random_vector(weights_key, config.network, environment)
     drivers: list[tuple[str, Agent]] = [
-        ("trained", greedy(jnp.array(policy.vector), config.network, environment)),
+        ("trained", policy_agent(policy, environment)),
         ("untrained", greedy(untrained, config.network, environment)),
         *((name, built_in(name, environment)) for name in reversed(NAMES[1:])),
     ]

@@ -7,8 +7,8 @@
     checkpoints/latest       a text file with the name of the newest
 
 `policy.npz` holds `vector` (float32, `state_dict` order), `layout_hash`, `network`,
-`sizes` and `extra` as JSON, and `actions`. `extra` belongs to the caller: it comes
-back as it was given.
+`sizes` and `extra` as JSON, `actions` (outputs) and `mixture` (its components, or 0).
+`extra` belongs to the caller: it comes back as it was given.
 
 A save writes into a temporary directory beside, flushes files and directory to the
 disk, renames it, and only then points `latest` at it: killed at any moment, it leaves
@@ -24,13 +24,15 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
-from actors.network import layout_hash
-from learner.learner import Learner
+from actors.network import Layout, NetworkConfig, layout_hash
+from learner.config import CloningConfig, LearnerConfig
+from sim.observation import ObservationSizes
 
 FORMAT = 1
 LATEST = "latest"
@@ -40,12 +42,43 @@ META = "meta.json"
 PARTIAL = ".partial-"
 
 
+@runtime_checkable
+class Trained(Protocol):
+    """What is saved: double DQN's learner, or behaviour cloning's."""
+
+    updates: int
+    sizes: ObservationSizes
+    network_config: NetworkConfig
+    actions: int  # outputs of the network
+
+    @property
+    def config(self) -> LearnerConfig | CloningConfig:
+        """Its settings."""
+
+    @property
+    def mixture(self) -> int:
+        """Components of the mixture that the outputs are; 0: one of each action."""
+
+    @property
+    def layout(self) -> Layout:
+        """Names and shapes of the weight vector."""
+
+    def policy_vector(self) -> Float[np.ndarray, " parameters"]:
+        """The weights to drive with."""
+
+    def state(self) -> dict[str, object]:
+        """All that `restore` takes."""
+
+    def restore(self, state: Mapping[str, object]) -> None:
+        """Goes on from there."""
+
+
 class CheckpointError(Exception):
     """A checkpoint cannot be used; the message says what, where and what to do."""
 
 
 def save_checkpoint(
-    folder: Path, *, learner: Learner, extra: Mapping[str, Any], keep: int = 3
+    folder: Path, *, learner: Trained, extra: Mapping[str, Any], keep: int = 3
 ) -> Path:
     """Writes the learner's state below `folder` and points `latest` at it.
 
@@ -108,7 +141,7 @@ def latest_checkpoint(folder: Path) -> Path | None:
     return folder / name
 
 
-def load_checkpoint(path: Path, *, learner: Learner) -> dict[str, Any]:
+def load_checkpoint(path: Path, *, learner: Trained) -> dict[str, Any]:
     """Restores the learner from a checkpoint and returns its `meta.json`.
 
     Args:
@@ -163,7 +196,7 @@ def read_meta(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _policy_bytes(learner: Learner, extra: Mapping[str, Any]) -> bytes:
+def _policy_bytes(learner: Trained, extra: Mapping[str, Any]) -> bytes:
     buffer = io.BytesIO()
     np.savez(
         buffer,
@@ -172,12 +205,13 @@ def _policy_bytes(learner: Learner, extra: Mapping[str, Any]) -> bytes:
         network=np.array(json.dumps(asdict(learner.network_config))),
         sizes=np.array(json.dumps(learner.sizes._asdict())),
         actions=np.array(learner.actions),
+        mixture=np.array(learner.mixture),
         extra=np.array(json.dumps(dict(extra))),
     )
     return buffer.getvalue()
 
 
-def _learner_bytes(learner: Learner) -> bytes:
+def _learner_bytes(learner: Trained) -> bytes:
     buffer = io.BytesIO()
     torch.save(learner.state(), buffer)
     return buffer.getvalue()
@@ -204,7 +238,7 @@ def _read_checked(path: Path, name: str, meta: Mapping[str, Any]) -> bytes:
     return data
 
 
-def _difference(meta: Mapping[str, Any], learner: Learner) -> str:
+def _difference(meta: Mapping[str, Any], learner: Trained) -> str:
     """The settings that differ, as `name there, here`."""
     there = {**meta["network"], **meta["sizes"], "actions": meta["actions"]}
     here = {

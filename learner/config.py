@@ -90,3 +90,46 @@ class LearnerConfig:
                 f"max_gradient_norm={self.max_gradient_norm} and average_updates="
                 f"{self.average_updates} must not be negative"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CloningConfig:
+    """Behaviour cloning. Defaults are the paper's (appendix A.2) but for the zeros."""
+
+    mixture: int = 10
+    """Components of the Gaussian mixture over continuous actions; 0 clones the grid's
+    actions by a softmax."""
+
+    learning_rate: float = 1e-4
+    """Adam's step size."""
+
+    adam_epsilon: float = 1e-8
+    """Added to Adam's denominator."""
+
+    batch_size: int = 256
+    """Expert actions per update."""
+
+    max_gradient_norm: float = 0.0
+    """Gradients are scaled down to this norm over all parameters; 0 means never."""
+
+    average_updates: int = 0
+    """The policy has the mean of the weights over about this many updates
+    (exponential); 0 is the network itself."""
+
+    torch_threads: int = 1
+    """Threads of torch in the learner's process."""
+
+    device: str = "cpu"
+    """Where torch computes: cpu, cuda, cuda:1, ..."""
+
+    seed: int = 0
+    """Seed of the network's first weights."""
+
+    def __post_init__(self) -> None:
+        """Refuses settings under which nothing is learnt."""
+        for name in ("learning_rate", "adam_epsilon", "batch_size", "torch_threads"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}={getattr(self, name)} must be above 0")
+        for name in ("mixture", "max_gradient_norm", "average_updates"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}={getattr(self, name)} must not be negative")

@@ -30,7 +30,7 @@ from torch import Tensor
 from actors.network import Layout, NetworkConfig, parameter_layout
 from learner.config import LearnerConfig
 from learner.losses import LossFunction, QBatch, TorchrlLosses, plain_losses
-from learner.network import QNetwork, to_torch, to_vector
+from learner.network import QNetwork, follow_average, to_torch, to_vector
 from learner.targets import importance_weights, weighted_mean
 from sim.observation import Observation, ObservationSizes
 
@@ -94,6 +94,11 @@ class Learner:
         self._losses = _loss_function(config, actions)
 
     @property
+    def mixture(self) -> int:
+        """0: the outputs are the actions' values."""
+        return 0
+
+    @property
     def layout(self) -> Layout:
         """Names and shapes of the weight vector."""
         return parameter_layout(self.network_config, self.sizes, self.actions)
@@ -119,7 +124,12 @@ class Learner:
         gradient_norm = self._clip_gradients()
         self.optimiser.step()
         self.updates += 1
-        self._follow_average()
+        follow_average(
+            self.average,
+            self.network,
+            updates=self.updates,
+            window=self.config.average_updates,
+        )
         if self.updates % self.config.target_period == 0:
             self._copy_target()
         q_tm1 = q_batch.q_tm1.detach()
@@ -190,16 +200,6 @@ class Learner:
             self.network.parameters(), limit, foreach=True
         )
         return float(norm)
-
-    @torch.no_grad()
-    def _follow_average(self) -> None:
-        """Moves the average towards the network; at first it is a plain mean."""
-        if self.config.average_updates:
-            torch._foreach_lerp_(
-                list(self.average.parameters()),
-                list(self.network.parameters()),
-                1.0 / min(self.updates, self.config.average_updates),
-            )
 
     @torch.no_grad()
     def _copy_target(self) -> None:

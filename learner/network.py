@@ -187,6 +187,19 @@ def load_vector(network: nn.Module, vector: Float[np.ndarray, " parameters"]) ->
             start += value.numel()
 
 
+@torch.no_grad()
+def follow_average(
+    average: nn.Module, network: nn.Module, *, updates: int, window: int
+) -> None:
+    """Moves the average towards the network; at first it is a plain mean."""
+    if window:
+        torch._foreach_lerp_(
+            list(average.parameters()),
+            list(network.parameters()),
+            1.0 / min(updates, window),
+        )
+
+
 def _initialise(network: QNetwork, generator: torch.Generator) -> None:
     """Truncated normals of variance 1 / inputs, zero biases, a small head.
 

@@ -317,11 +317,19 @@ def nearest_action(
 ) -> Int[Array, ""]:
     """The grid's index nearest to a continuous action, each component by its limit."""
     table = action_table(config)
-    if config.space == ActionSpace.DELTA:
-        action = _turned(action, -state.yaw)
+    action = in_own_frame(state, action, config)
     scale = np.maximum(np.abs(table).max(0), 1e-6)
     difference = (jnp.asarray(table) - action[None]) / jnp.asarray(scale)[None]
     return jnp.argmin((difference**2).sum(-1)).astype(jnp.int32)
+
+
+def in_own_frame(
+    state: ObjectState, action: Float[Array, " components"], config: ActionConfig
+) -> Float[Array, " components"]:
+    """An action of `inverse` as `apply_continuous` takes it: Delta's is turned."""
+    if config.space == ActionSpace.DELTA:
+        return _turned(action, -state.yaw)
+    return action
 
 
 def _turned(action: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3"]:
