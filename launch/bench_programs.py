@@ -38,6 +38,7 @@ from sim.environment import (
 )
 
 ROLLOUT_STEPS: Final = 80
+COLUMNS: Final = ("reset", "transition", "metrics", "rollout")
 
 
 class Step(NamedTuple):
@@ -144,28 +145,36 @@ def at_work(
 ) -> tuple[Int[Array, "*batch"], State, State, Float[Array, "*batch objects 2"]]:
     """Arguments for the programs: scenes, the first two states, actions."""
     scene = jnp.zeros(() if batch == 1 else batch, jnp.int32)
-    state = many(functools.partial(resets, config=config), batch, None, 0)(bank, scene)
+    resetting = many(functools.partial(resets, config=config), batch, None, 0)
+    state = jax.jit(resetting)(bank, scene)
     action = jnp.zeros((*state.controlled.shape, 2)).at[..., 0].set(0.5)
-    step = functools.partial(transition, config=config)
-    return scene, state, many(step, batch, None, 0, 0)(bank, state, action), action
+    moving = many(functools.partial(transition, config=config), batch, None, 0, 0)
+    return scene, state, jax.jit(moving)(bank, state, action), action
 
 
-def ours(bank: Bank, batch: int, config: EnvironmentConfig) -> dict[str, Program]:
+def ours(
+    bank: Bank, batch: int, config: EnvironmentConfig, names: tuple[str, ...] = COLUMNS
+) -> dict[str, Program]:
     """The columns of table 6; no rollout of a batch, as in the paper."""
     scene, state, following, action = at_work(bank, batch, config)
-    resetting = many(functools.partial(resets, config=config), batch, None, 0)
-    moving = many(functools.partial(transition, config=config), batch, None, 0, 0)
-    judging = many(functools.partial(judge, dt=config.dt), batch, None, 0, 0)
-    programs = {
-        "reset": compiled(resetting, bank, scene),
-        "transition": compiled(moving, bank, state, action),
-        "metrics": compiled(judging, bank, state, following),
+
+    def rolling(bank: Bank, scene: Int[Array, ""]) -> Step:
+        return rollout(bank, None, scene, config)
+
+    resetting = functools.partial(resets, config=config)
+    moving = functools.partial(transition, config=config)
+    judging = functools.partial(judge, dt=config.dt)
+    whole: dict[str, tuple[Callable[..., Any], tuple[Any, ...]]] = {
+        "reset": (many(resetting, batch, None, 0), (bank, scene)),
+        "transition": (many(moving, batch, None, 0, 0), (bank, state, action)),
+        "metrics": (many(judging, batch, None, 0, 0), (bank, state, following)),
+        "rollout": (rolling, (bank, scene)),
     }
-    if batch == 1:
-        programs["rollout"] = compiled(
-            lambda bank, scene: rollout(bank, None, scene, config), bank, scene
-        )
-    return programs
+    return {
+        name: compiled(function, *arguments)
+        for name, (function, arguments) in whole.items()
+        if name in names and (name != "rollout" or batch == 1)
+    }
 
 
 def oracle(

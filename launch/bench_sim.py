@@ -2,7 +2,9 @@
 
 Sections, each of which can be had alone: `table6` (Gulino et al., 2023, appendix A.3,
 with its figures 4 and 5), `oracle` (the same work by brute force in the same run),
-`bicycle` (the one-step error on logs). Figures are ratios within one run where they
+`steps` (whole environment steps on one core), `scale` (their cost against the number of
+environments and objects), `banks` (the cost of the number of scenes), `bicycle` (the
+one-step error on logs). Figures are ratios within one run where they
 are to hold on another machine; every run says what machine it was.
 
 Each section runs in a process of its own (`launch.bench_child`). Files are written at
@@ -16,18 +18,19 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
-from launch import bench_child, bench_print
+from launch import bench_child, bench_print, bench_targets
 from launch.bench_scenes import description, source_of
 from launch.bench_sections import ONE_CORE, Sizes
+from launch.bench_steps import STEPS
 from launch.config import write_atomically
 from launch.errors import LaunchError
 from launch.evaluate import printer
 
 FORMAT: Final = 1
-Section = Literal["table6", "oracle", "bicycle"]
-ALL: Final[tuple[Section, ...]] = ("table6", "oracle", "bicycle")
+Section = Literal["table6", "oracle", "steps", "scale", "banks", "bicycle"]
+ALL: Final[tuple[Section, ...]] = get_args(Section)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +49,12 @@ class SimConfig:
     """Object slots of table 6 and the oracle."""
     batches: tuple[int, ...] = (1, 16)
     """Batch sizes of table 6."""
+    environments: tuple[int, ...] = (1, 4, 16, 64, 256, 1024, 4096)
+    """Environments of the cost against scale."""
+    scale_objects: tuple[int, ...] = (8, 16, 32, 64, 128, 256)
+    """Objects of it; where the scene has fewer, copies of its own fill up."""
+    bank_scenes: tuple[int, ...] = (1, 1000)
+    """Procedural scenes of the banks; generating 10,000 takes many minutes."""
     seconds: float = 0.5
     """How long each program is timed."""
     json: str = ""
@@ -55,9 +64,16 @@ class SimConfig:
 
     def __post_init__(self) -> None:
         """Refuses sizes of nothing."""
-        counts = (*self.objects, *self.batches)
-        if not self.objects or not self.batches or min(counts) < 1:
-            raise ValueError("objects and batches need numbers of at least 1")
+        counts = {
+            "objects": self.objects,
+            "batches": self.batches,
+            "environments": self.environments,
+            "scale-objects": self.scale_objects,
+            "bank-scenes": self.bank_scenes,
+        }
+        for name, values in counts.items():
+            if min(values, default=0) < 1:
+                raise ValueError(f"--{name} needs numbers of at least 1")
         if self.seconds <= 0:
             raise ValueError(f"seconds={self.seconds} must be above 0")
 
@@ -65,8 +81,24 @@ class SimConfig:
     def sizes(self) -> Sizes:
         """How much is measured."""
         if self.quick:
-            return Sizes(objects=self.objects[:1], batches=(1,), seconds=0.02)
-        return Sizes(self.objects, self.batches, self.seconds)
+            return Sizes(
+                objects=self.objects[:1],
+                batches=(1,),
+                steps=((2, 4), (1, 8)),
+                environments=(1, 4),
+                scale_objects=self.scale_objects[:2],
+                bank_scenes=(1, 2),
+                seconds=0.02,
+            )
+        return Sizes(
+            objects=self.objects,
+            batches=self.batches,
+            steps=STEPS,
+            environments=self.environments,
+            scale_objects=self.scale_objects,
+            bank_scenes=self.bank_scenes,
+            seconds=self.seconds,
+        )
 
 
 def sim_command(options: SimConfig) -> int:
@@ -98,7 +130,7 @@ def sim_command(options: SimConfig) -> int:
         for table in bench_print.section_tables(name, rows):
             if not quiet:
                 console.print(table)
-    report["targets"] = bench_print.targets(report["sections"])
+    report["targets"] = bench_targets.targets(report["sections"])
     if report["targets"] and not quiet:
         console.print(bench_print.targets_table(report["targets"]))
     _write(options, report)

@@ -33,6 +33,9 @@ class Work:
     folder: Path  # for banks, temporary
     objects: tuple[int, ...]
     batches: tuple[int, ...]
+    steps: tuple[tuple[int, int], ...]  # controlled, environments
+    environments: tuple[int, ...]
+    scale_objects: tuple[int, ...]
     seconds: float  # per timed program
     say: Callable[[str], None]
 
@@ -109,14 +112,14 @@ def oracle(work: Work) -> Iterator[dict[str, Any]]:
     with jax.default_device(jax.devices("cpu")[0]):
         for slots in work.objects:
             chosen = [YARDSTICK] if slots < largest else list(VARIANTS)
-            yield _beside_oracle(work, slots, chosen)
+            yield beside_oracle(work, slots, chosen)
 
 
-def _beside_oracle(work: Work, slots: int, variants: list[str]) -> dict[str, Any]:
+def beside_oracle(work: Work, slots: int, variants: list[str]) -> dict[str, Any]:
+    """One size: ours and some variants of the oracle."""
     scene = work.sized(slots)
     bank, config = scene.file.bank, configuration(scene.file.dt)
-    own = bench_programs.ours(bank, 1, config)
-    own = {name: own[name] for name in ("metrics", "rollout")}
+    own = bench_programs.ours(bank, 1, config, ("metrics", "rollout"))
     work.say(f"oracle: {slots} objects")
     row: dict[str, Any] = {"slots": slots, "objects": scene.objects, "oracle": {}}
     for variant in variants:

@@ -1,9 +1,11 @@
 """`bench sim`: its oracle, its timing, its tables and the command itself."""
 
+import dataclasses
 import itertools
 import json
 import re
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -11,13 +13,41 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from launch import bench_child, bench_figures, bench_oracle, bench_print, bench_programs
-from launch.bench_bicycle import errors, pairs_of
+from launch import (
+    bench_child,
+    bench_figures,
+    bench_oracle,
+    bench_programs,
+    bench_steps,
+)
+from launch.bench_bicycle import bicycle, errors, pairs_of
 from launch.bench_paper import TABLE_6, paper_row
-from launch.bench_scenes import PROCEDURAL, padded, sized, source_of, tiled
-from launch.bench_table6 import Work, agreement, configuration, oracle, table6
-from launch.bench_timing import matrix_product_gflops, side_by_side, timed
+from launch.bench_scenes import (
+    PROCEDURAL,
+    padded,
+    road_points,
+    sized,
+    source_of,
+    tiled,
+)
+from launch.bench_sim import ALL
+from launch.bench_table6 import (
+    YARDSTICK,
+    Work,
+    agreement,
+    beside_oracle,
+    configuration,
+    table6,
+)
+from launch.bench_targets import targets
+from launch.bench_timing import (
+    matrix_product_gflops,
+    side_by_side,
+    timed,
+    yardsticks,
+)
 from launch.main import main
+from sim import episodes
 from sim.procedural import generate
 from sim.scene import Scene
 from tests import scenes
@@ -37,21 +67,41 @@ def work(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Work:
         folder=tmp_path_factory.mktemp("banks"),
         objects=(8,),
         batches=(1,),
+        steps=((2, 3),),
+        environments=(2,),
+        scale_objects=(8,),
         seconds=0.01,
         say=lambda _: None,
     )
 
 
 @pytest.fixture(scope="module")
-def oracle_row(work: Work) -> dict:
-    (row,) = oracle(work)
-    return row
+def own(work: Work) -> dict[str, bench_programs.Program]:
+    """Our programs, compiled once for all tests."""
+    file = work.sized(8).file
+    return bench_programs.ours(file.bank, 1, configuration(file.dt))
 
 
 @pytest.fixture(scope="module")
-def table6_row(work: Work) -> dict:
-    (row,) = table6(work)
-    return row
+def rows(work: Work, own: dict) -> dict[str, list[dict]]:
+    """Results of the sections on the scene."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench_programs, "ours", lambda *_: own)
+        return {
+            "table6": list(table6(work)),
+            "oracle": [beside_oracle(work, 8, [YARDSTICK])],
+            "bicycle": list(bicycle([work.scene])),
+        }
+
+
+@pytest.fixture(scope="module")
+def oracle_row(rows: dict[str, list[dict]]) -> dict:
+    return rows["oracle"][0]
+
+
+@pytest.fixture(scope="module")
+def table6_row(rows: dict[str, list[dict]]) -> dict:
+    return rows["table6"][0]
 
 
 def test_the_oracle_judges_as_the_simulator_does(oracle_row: dict) -> None:
@@ -62,16 +112,14 @@ def test_the_oracle_judges_as_the_simulator_does(oracle_row: dict) -> None:
     assert agreed["log_divergence_largest_difference_m"] < 1e-5
 
 
-def test_every_variant_of_the_oracle_is_beside_ours(oracle_row: dict) -> None:
-    assert len(oracle_row["oracle"]) == 3
-    for name, variant in oracle_row["oracle"].items():
-        fewer = name == "edge points only"
-        assert fewer == (variant["points"] < 1000), name
-        for program in ("metrics", "rollout"):
-            found = variant[program]
-            ratio = found["oracle"]["median_ms"] / found["ours"]["median_ms"]
-            assert found["ratio"] == pytest.approx(ratio)
-            assert found["ours"]["least_ms"] <= found["ours"]["median_ms"]
+def test_the_oracle_is_beside_ours(work: Work, oracle_row: dict) -> None:
+    variant = oracle_row["oracle"][YARDSTICK]
+    assert variant["points"] == road_points(work.scene)
+    for program in ("metrics", "rollout"):
+        found = variant[program]
+        ratio = found["oracle"]["median_ms"] / found["ours"]["median_ms"]
+        assert found["ratio"] == pytest.approx(ratio)
+        assert 0 < found["ours"]["least_ms"] <= found["ours"]["median_ms"]
 
 
 def dense(*points: tuple[float, float]) -> np.ndarray:
@@ -152,15 +200,9 @@ def test_the_papers_table_is_whole() -> None:
     assert paper_row("cpu", 1, 256) is None
 
 
-def test_a_rollout_drives_the_log(scene: Scene, work: Work) -> None:
+def test_a_rollout_drives_the_log(own: dict) -> None:
     """The expert of the procedural log neither fails nor strays."""
-    file = work.sized(8).file
-    config = configuration(file.dt)
-    bank = file.bank
-    step = jax.jit(
-        lambda bank: bench_programs.rollout(bank, None, jnp.int32(0), config)
-    )
-    result = jax.device_get(step(bank))
+    result = jax.device_get(own["rollout"].call())
     assert result.reward.shape == (80, 8)
     assert result.valid.all()
     assert not result.overlap.any() and not result.offroad.any()
@@ -216,25 +258,85 @@ def image_size(data: bytes) -> tuple[int, int]:
     return struct.unpack(">II", data[16:24])
 
 
-def test_the_command_measures_prints_and_writes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_command_prints_and_writes(
+    rows: dict[str, list[dict]],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    words = ["bench", "sim", "--quick", "--scenes", PROCEDURAL]
-    words += ["--sections", "table6", "bicycle", "--json", str(tmp_path / "sim.json")]
-    assert main([*words, "--plot", str(tmp_path / "plots")]) == 0
+    sections = {**rows, "yardsticks": [yardsticks(seconds=0.001)]}
+    asked = []
+
+    def run(section: str, request: dict, *, one_core: bool) -> Iterator[dict]:
+        asked.append((section, one_core))
+        return iter(json.loads(json.dumps(sections[section])))
+
+    monkeypatch.setattr(bench_child, "run", run)
+    words = ["bench", "sim", "--scenes", PROCEDURAL, "--plot", str(tmp_path / "plots")]
+    words += ["--sections", "table6", "oracle", "bicycle"]
+    assert main([*words, "--json", str(tmp_path / "sim.json")]) == 0
+    expected = [("yardsticks", True), ("table6", False), ("oracle", False)]
+    assert asked == [*expected, ("bicycle", False)]
     shown = capsys.readouterr().out
     assert "procedural scene" in shown and "road points" in shown
-    for word in ("GFLOP/s", "Table 6", "Bicycle", "Targets"):
+    for word in ("GFLOP/s", "Table 6", "oracle / ours", "Bicycle", "Targets", "[ms]"):
         assert word in shown
     report = json.loads((tmp_path / "sim.json").read_text())
     assert report["format"] == 1
-    assert set(report["sections"]) == {"table6", "bicycle"}
+    assert report["sections"] == json.loads(json.dumps(rows))
     assert report["yardsticks"]["matrix_product_gflops"] > 0.1
     assert report["scene"]["road_points"] > report["scene"]["road_edge_points"] > 0
-    assert report["sections"]["table6"][0]["slots"] == 8
     assert {row["target"] for row in report["targets"]} >= {"Reset, 8 [ms]"}
     names = {path.name for path in (tmp_path / "plots").iterdir()}
-    assert names == {f"figure{i}.{kind}" for i in (4, 5) for kind in ("png", "svg")}
+    figures = ("figure4", "figure5", "oracle")
+    assert names == {f"{name}.{kind}" for name in figures for kind in ("png", "svg")}
+    assert main([*words[:4], "--sections", "bicycle", "--json", "-"]) == 0
+    assert set(json.loads(capsys.readouterr().out)["sections"]) == {"bicycle"}
+
+
+def test_a_section_is_measured_in_a_process_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = dataclasses.asdict(source_of((PROCEDURAL,)))
+    found = list(bench_child.run("bicycle", {"source": source}, one_core=True))
+    assert found[-1]["scene"] == "all" and found[-1]["bicycle"]["p99_m"] < 0.1
+    monkeypatch.setattr(bench_child.sys, "executable", "/bin/false")
+    with pytest.raises(RuntimeError, match="section bicycle"):
+        list(bench_child.run("bicycle", {}))
+
+
+@pytest.mark.slow
+def test_every_section_is_measured_and_drawn(tmp_path: Path) -> None:
+    words = ["bench", "sim", "--quick", "--scenes", PROCEDURAL]
+    words += ["--json", str(tmp_path / "sim.json"), "--plot", str(tmp_path / "plots")]
+    assert main(words) == 0
+    sections = json.loads((tmp_path / "sim.json").read_text())["sections"]
+    assert set(sections) == set(ALL)
+    axes = [row["axis"] for row in sections["scale"]]
+    assert axes == ["environments", "environments", "objects", "objects"]
+    assert [row["scenes"] for row in sections["banks"]] == [1, 2]
+    for row in sections["banks"]:
+        assert 0 < row["open_ms"] < 1000 and row["random_reset_us"] > 0
+        assert row["loaded_bytes"] < row["file_bytes"]
+    drawn = {path.stem for path in (tmp_path / "plots").glob("*.png")}
+    assert drawn == {"figure4", "figure5", "oracle", "scale", "banks"}
+    for path in (tmp_path / "plots").glob("*.png"):
+        assert min(image_size(path.read_bytes())) > 600
+
+
+@pytest.mark.slow
+def test_whole_steps_go_on_past_the_end_of_episodes(work: Work) -> None:
+    file = work.sized(8).file
+    config = configuration(file.dt)
+    batch = bench_steps.running(file.bank, 3, episodes.NearestToSdc(2), config)
+    state, _, seen = batch.step()
+    assert seen.road.shape[:3] == (3, 2, 64)
+    assert bench_steps.bytes_of(seen) == 6 * batch.observation_bytes
+    steps = {int(batch.step()[0].step[0]) for _ in range(100)}
+    assert int(file.arrays["current_step"][0]) in steps  # it began again
+    held = bench_steps.state_bytes(file.bank, episodes.NearestToSdc(2), config)
+    assert bench_steps.bytes_of(state) == 3 * held
+    assert 0 < batch.recorded() <= 1
 
 
 def test_figures_show_ours_and_the_papers(table6_row: dict) -> None:
@@ -249,9 +351,12 @@ def test_figures_show_ours_and_the_papers(table6_row: dict) -> None:
 
 
 def test_targets_follow_from_what_was_measured(oracle_row: dict) -> None:
-    assert bench_print.targets({"oracle": [oracle_row]}) == []
+    assert targets({"oracle": [oracle_row]}) == []
     large = {**oracle_row, "slots": 128}
-    found = bench_print.targets({"oracle": [large]})
+    rates = {"controlled": 1, "environments": 512, "slots": 128, "whole": True}
+    rates["agent_steps_per_s"] = 10.0
+    assert [row["met"] for row in targets({"steps": [rates]})] == [False]
+    found = targets({"oracle": [large]})
     assert [row["at least"] for row in found] == [150, 200]
     assert all(row["met"] == (row["measured"] >= row["at least"]) for row in found)
 
@@ -290,8 +395,3 @@ def test_of_the_data_the_flat_example_is_measured(scenes_data: Path) -> None:
     assert source.kind == "recorded"
     assert bench_oracle.road_points(source.scene(), (0.0, 0.0, 0.0)).x.shape == (20000,)
     assert len(source.scenes()) >= 5
-
-
-def test_a_section_that_fails_is_not_passed_over() -> None:
-    with pytest.raises(RuntimeError, match="section nothing"):
-        list(bench_child.run("nothing", {}))
