@@ -175,8 +175,9 @@ def _table(path: Path) -> _Table:
 
 
 def _line(error: Exception) -> str:
-    """An error's first line."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
+    """An error's first line; it may quote bytes of the file."""
+    first = (str(error).splitlines() or [type(error).__name__])[0][:200]
+    return "".join(char if char.isprintable() else "?" for char in first)
 
 
 def _column(table: _Table, name: str, kind: _ArrowType, path: Path) -> _Column:

@@ -18,7 +18,8 @@ from sim.tables import CELL, EDGE_CELL, FINE, Grid
 
 BELOW, ABOVE = 0.5, 3.0  # m; a box's centre is 0.5 to 2 m above the road
 NEARBY = 3  # cells: road points this near to a cell set its range of heights
-LEVELS = (32, 8, 1)  # sides of the squares that `edge_table` decides, in fine cells
+LEVELS = (128, 32, 8, 1)  # sides of the squares that `edge_table` decides, fine cells
+PAIRS = 2**20  # of squares and edges compared at a time: some 150 MB
 CLOSED = 1e-3  # m between the ends of an edge that is a ring
 HEIGHT_WEIGHT = 2.0  # the benchmark's: a bridge is not the road below
 
@@ -110,22 +111,30 @@ def edge_table(
     while pending:
         corner, index, width = pending.pop()
         size = next(level for level in LEVELS if level < width)
-        corners = _children(corner, width, size, fine.shape)
-        centres = grid.origin + (corners + size / 2) * EDGE_CELL
-        bounds = _bounds(heights, corners, size)
         subset = edges.take(index)
-        possible, squared = _possible(centres, bounds, subset, size * EDGE_CELL)
-        agreed = _agreed(centres, possible, subset, size * EDGE_CELL)
-        _paint(state, corners, size, agreed)
-        for row in np.flatnonzero(agreed == MIXED):
-            i, j = corners[row]
-            near = np.flatnonzero(possible[row])
-            if size > 1:
-                pending.append((corners[row], index[near], size))
-            else:
-                near = near[squared[row, near].argsort(kind="stable")]
-                candidates[i * fine.shape[1] + j] = index[near]
+        for corners in _portions(_children(corner, width, size, fine.shape), index):
+            centres = grid.origin + (corners + size / 2) * EDGE_CELL
+            bounds = _bounds(heights, corners, size)
+            possible, squared = _possible(centres, bounds, subset, size * EDGE_CELL)
+            agreed = _agreed(centres, possible, subset, size * EDGE_CELL)
+            _paint(state, corners, size, agreed)
+            for row in np.flatnonzero(agreed == MIXED):
+                i, j = corners[row]
+                near = np.flatnonzero(possible[row])
+                if size > 1:
+                    pending.append((corners[row], index[near], size))
+                else:
+                    near = near[squared[row, near].argsort(kind="stable")]
+                    candidates[i * fine.shape[1] + j] = index[near]
     return state.ravel(), candidates
+
+
+def _portions(
+    corners: Int[np.ndarray, "squares 2"], index: Int[np.ndarray, " edges"]
+) -> list[Int[np.ndarray, "_ 2"]]:
+    """The squares in portions of at most `PAIRS` pairs with an edge, or one square."""
+    size = max(PAIRS // len(index), 1)
+    return [corners[i : i + size] for i in range(0, len(corners), size)]
 
 
 def _paint(

@@ -20,6 +20,8 @@ _POSITION_LIMIT = 1e8  # m; a map grid's coordinates reach 1e7
 _SPEED_LIMIT = 1e4  # m/s
 _SIZE_LIMIT = 1e3  # m
 _YAW_LIMIT = 1e4  # rad
+_SIDE_LIMIT = 5e4  # m: farther out float32's steps reach 4 mm
+_AREA_LIMIT = 25e6  # m^2 that the map and the logs span: tables cover all of it
 
 
 def check_scene(scene: Scene) -> Scene:
@@ -37,6 +39,7 @@ def _problems(scene: Scene) -> Iterator[str]:
     yield from _state_problems(scene)
     yield from _map_problems(scene)
     yield from _path_problems(scene)
+    yield from _extent_problems(scene)
     yield from _light_problems(scene)
 
 
@@ -140,6 +143,22 @@ def _path_problems(scene: Scene) -> Iterator[str]:
             yield f"SDC path {index} has points of shape {path.points.shape}"
         elif len(path.points) < 2 or not _within(path.points, _POSITION_LIMIT).all():
             yield f"SDC path {index} has a point that is not finite, or fewer than two"
+
+
+def _extent_problems(scene: Scene) -> Iterator[str]:
+    """Whether the map and all recorded positions lie near enough to each other."""
+    points = [road.points[:, :2] for road in scene.roads]
+    every = np.concatenate([*points, scene.position[scene.valid][:, :2]])
+    if not len(every):
+        yield "no object is ever valid, and there is no map"
+        return
+    width, height = (every.max(axis=0) - every.min(axis=0)).tolist()
+    if max(width, height) > _SIDE_LIMIT or width * height > _AREA_LIMIT:
+        yield (
+            f"the map and the recorded positions span {width:.0f} x {height:.0f} m, at "
+            f"most {_SIDE_LIMIT:g} m and {_AREA_LIMIT:g} m^2; crop them, or correct "
+            "the point that is far off"
+        )
 
 
 def _light_problems(scene: Scene) -> Iterator[str]:

@@ -206,7 +206,7 @@ def encode_example(features: dict[str, Any]) -> bytes:
         entry = message.features.feature.add(key=name.encode())
         if isinstance(values, bytes):
             entry.value.bytes_list.value.append(values)
-        elif isinstance(values[0], float):
+        elif any(isinstance(value, float) for value in values):
             entry.value.float_list.value.extend(values)
         else:
             entry.value.int64_list.value.extend(values)

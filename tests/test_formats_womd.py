@@ -332,3 +332,11 @@ def test_real_frames_are_at_their_offsets(scenes_data: Path) -> None:
     assert isinstance(record, Record)
     assert record.offset == 0
     assert len(record.payload) + 16 == path.stat().st_size
+
+
+def test_a_point_that_is_far_off_is_refused() -> None:
+    """Tables cover all between the points: a stray one would cost all memory."""
+    message = records.scenario()
+    message.map_features[1].road_edge.polyline[0].y = 1e6
+    with pytest.raises(SceneError, match="span 70 x 100000[34] m, at most 50000 m"):
+        _parse(message)
