@@ -65,6 +65,7 @@ class Tally:
     other_dt: int = 0  # scenes of another step length
     cut: int = 0  # scenes with more objects than slots
     dropped: int = 0  # their objects without a slot
+    left_out: int = 0  # map features of unknown kinds or without points
     resumed: int = 0  # records that an earlier conversion had converted
 
     @property
@@ -87,6 +88,7 @@ class Tally:
                 self.cut,
                 f"{self.dropped} objects of {self.cut} scenes without a slot",
             ),
+            (self.left_out, f"{self.left_out} map features could not be used"),
             (self.resumed, f"{self.resumed} records were converted before"),
         )
         return "".join(f"; {words}" for count, words in said if count)
@@ -218,6 +220,7 @@ class Gathered:
             scenes=len(self.parts),
             cut=self.tally.cut + (part.dropped > 0),
             dropped=self.tally.dropped + part.dropped,
+            left_out=self.tally.left_out + part.left_out,
         )
 
     def _report(self, line: str) -> None:

@@ -228,6 +228,7 @@ def _scene_info(scene: Scene) -> dict[str, Any]:
         "dt": scene.dt,
         "lights": len(scene.lights.lane_ids),
         "dropped": 0,
+        "left_out": scene.left_out,
         "roads": kinds,
     }
 
@@ -244,6 +245,7 @@ def _bank_info(bank: BankFile) -> list[dict[str, Any]]:
             "dt": bank.dt,
             "lights": int(arrays["lights"][row]),
             "dropped": bank.header.dropped[row],
+            "left_out": bank.header.left_out[row],
         }
         for row, name in enumerate(bank.scenario_ids)
     ]

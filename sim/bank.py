@@ -111,6 +111,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     scenario_ids: tuple[str, ...]
     origins: tuple[tuple[float, float, float], ...]  # m, map frame
     dropped: tuple[int, ...]  # objects of each scene that there was no slot for
+    left_out: tuple[int, ...]  # map features of each scene that could not be used
 
 
 @final
@@ -193,7 +194,8 @@ def open_bank(path: Path) -> BankFile:
         raise _broken(path) from error
     if set(arrays) != set(Bank._fields):
         raise BankError(f"bank {path} lacks arrays; convert its scenes again")
-    if len({len(header.scenario_ids), len(header.origins), len(header.dropped)}) > 1:
+    each = (header.scenario_ids, header.origins, header.dropped, header.left_out)
+    if len({len(values) for values in each}) > 1:
         raise _broken(path)
     return BankFile(path, header, arrays)
 

@@ -123,6 +123,7 @@ def _header_of(parts: Sequence[Part], specs: Mapping[str, Spec]) -> Header:
         scenario_ids=tuple(part.scenario_id for part in parts),
         origins=tuple(part.origin for part in parts),
         dropped=tuple(part.dropped for part in parts),
+        left_out=tuple(part.left_out for part in parts),
     )
 
 

@@ -162,6 +162,7 @@ def parse_gpudrive(text: bytes, *, source: str) -> Scene:
             size=states[..., 7:10],
             valid=states[..., 0] > 0,
             roads=tuple(_road(r, source) for r in file.roads if r.geometry),
+            left_out=sum(not road.geometry for road in file.roads),
             lights=_lights(file.tl_states, steps, source),
             tracks_to_predict=each_once(
                 p.track_index for p in metadata.tracks_to_predict

@@ -28,6 +28,7 @@ class Part(NamedTuple):
     origin: tuple[float, float, float]  # m, map frame
     dt: float  # s
     dropped: int  # objects that there was no slot for
+    left_out: int  # map features that could not be used
     source: str  # for messages
     sizes: Callable[[], Sizes]
     load: Callable[[], Converted]
@@ -41,6 +42,7 @@ class _Description(msgspec.Struct, frozen=True, kw_only=True):
     origin: tuple[float, float, float]
     dt: float
     dropped: int
+    left_out: int
     source: str
     shapes: dict[str, tuple[int, ...]]
     dtypes: dict[str, str]
@@ -57,6 +59,7 @@ def part_of(scene: Scene, *, dropped: int = 0) -> Part:
         origin=(x, y, z),
         dt=round(scene.dt, 6),
         dropped=dropped,
+        left_out=scene.left_out,
         source=scene.source or scene.scenario_id,
         sizes=lambda: sizes_of(converted),
         load=lambda: converted,
@@ -71,6 +74,7 @@ def write_part(path: Path, part: Part) -> None:
         origin=part.origin,
         dt=part.dt,
         dropped=part.dropped,
+        left_out=part.left_out,
         source=part.source,
         shapes=sizes.shapes,
         dtypes={name: dtype.str for name, dtype in sizes.dtypes.items()},
@@ -87,6 +91,7 @@ def write_failure(path: Path, failure: SceneError) -> None:
         origin=(0.0, 0.0, 0.0),
         dt=0.0,
         dropped=0,
+        left_out=0,
         source="",
         shapes={},
         dtypes={},
@@ -119,6 +124,7 @@ def read_part(path: Path) -> Part | SceneError | None:
         origin=description.origin,
         dt=description.dt,
         dropped=description.dropped,
+        left_out=description.left_out,
         source=description.source,
         sizes=partial(_sizes, path),
         load=partial(_load, path),

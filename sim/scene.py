@@ -134,6 +134,7 @@ class Scene:
     tracks_to_predict: tuple[int, ...] = ()
     objects_of_interest: tuple[int, ...] = ()  # rows, as tracks_to_predict
     sdc_paths: tuple[LanePath, ...] = ()  # none where the source has no samples
+    left_out: int = 0  # map features of an unknown kind or without points
     source: str = field(default="", compare=False)  # file and record, for messages
 
     @property

@@ -129,6 +129,7 @@ def parse_scenario(payload: bytes, *, source: str) -> Scene:
     if not scenario.tracks:
         raise SceneError(f"{source}: not a WOMD Scenario message, or without tracks")
     states = _states(scenario, source)
+    roads = tuple(_roads(scenario.map_features))
     object_ids = [track.id for track in scenario.tracks]
     return check_scene(
         Scene(
@@ -143,12 +144,13 @@ def parse_scenario(payload: bytes, *, source: str) -> Scene:
             velocity=states[..., 8:10],
             size=states[..., 4:7],
             valid=states[..., 0] > 0,
-            roads=tuple(_roads(scenario.map_features)),
+            roads=roads,
             lights=_lights(scenario),
             tracks_to_predict=each_once(
                 p.track_index for p in scenario.tracks_to_predict
             ),
             objects_of_interest=rows_of(scenario.objects_of_interest, object_ids),
+            left_out=len(scenario.map_features) - len(roads),
             source=source,
         )
     )

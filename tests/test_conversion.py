@@ -204,6 +204,17 @@ def test_a_damaged_work_file_is_made_anew(tmp_path: Path) -> None:
     assert all(isinstance(o.result, Part) and o.result.load() for o in again)
 
 
+def test_map_features_left_out_are_counted(tmp_path: Path, capsys) -> None:
+    path, out = tmp_path / "a.rec", tmp_path / "a.bank"
+    made = records.scenario(name="one")
+    made.map_features.add(id=90)  # of a kind that is not known
+    made.map_features.add(id=91).road_line.type = 8  # without points
+    records.write_tfrecord(path, [made.SerializeToString()])
+    code, summary = convert(capsys, path, "--out", out)
+    assert (code, summary["left_out"]) == (0, 2)
+    assert open_bank(out).header.left_out == (2,)
+
+
 def test_a_place_is_read_where_it_is(tmp_path: Path) -> None:
     path = tmp_path / "a.rec"
     offsets = shard(path, "one", "two", "three")
