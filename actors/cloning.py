@@ -135,10 +135,13 @@ def cloned(
     *,
     components: int,
     choice: Choice = "mode",
+    slots: int | None = None,
 ) -> Agent:
     """Drives by a cloned policy: a mixture of so many components, 0 for the grid.
 
     On the grid `mode` and `mean` are the likeliest index, since indices have no mean.
+    With `slots` it decides for the first ones only, as `sim.agents.composite` takes it:
+    the network costs more than all else.
     """
     sizes = observation_sizes(config.observation)
     outputs = policy_outputs(config.action, components)
@@ -164,18 +167,20 @@ def cloned(
     def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
         view = jax.tree.map(lambda value: value[None], state.view)
         observation = jax.tree.map(
-            lambda values: values[0], observe_batch(bank, view, config.observation)
+            lambda values: values[0, :slots],
+            observe_batch(bank, view, config.observation),
         )
+        now = state.history[:slots, -1]
         values = batched(
             vector, observation, config=network, sizes=sizes, actions=outputs
         )
         keys = jax.random.split(key, values.shape[0])
         if components:
-            return continuous(jax.vmap(move)(keys, state.history[:, -1], values))
+            return continuous(jax.vmap(move)(keys, now, values))
         if choice == "sample":
             action = jax.vmap(jax.random.categorical)(keys, values)
         else:
             action = jnp.argmax(values, -1)
-        return discrete(state, action.astype(jnp.int32), values, config)
+        return discrete(now, action.astype(jnp.int32), values, config)
 
     return act

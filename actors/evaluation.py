@@ -3,19 +3,22 @@
 A scenario is driven to its end whatever happens in it; a failure is an overlap or
 off-road at some step within it (Gulino et al., 2023). Steps at which an object was not
 recorded do not count. Playback (`log`) is judged from the scene's first step, agents
-from the first step that they decided.
+from the first step that they decided. Wrong-way and off-route count from
+`Bank.current_step` on, where an object's lane paths begin.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sim import metrics
+from actors.controlled import ControlledSet, sdc_of
+from actors.results import RATES, Figure, SceneResult, figures_of
+from sim import metrics, route_metrics
 from sim.agents import Agent
 from sim.bank import Bank, BankFile
 from sim.dynamics import ObjectState
@@ -27,6 +30,10 @@ from sim.environment import (
     logged_states,
     start_at,
 )
+from sim.world import row_of
+
+MANY = 8  # controlled objects of a scene from which on fewer scenes are driven at once
+Slots = TypeVar("Slots")
 
 
 class Trace(NamedTuple):
@@ -40,24 +47,12 @@ class Trace(NamedTuple):
     offroad: Bool[Array, "*axes controlled"]
     infeasible: Bool[Array, "*axes controlled"]
     displacement: Float[Array, "*axes controlled"]  # m from the log
-    progress: Float[Array, "*axes controlled"]
+    progress: Float[Array, "*axes controlled"]  # of the logged route, NaN: has none
+    wrong_way: Bool[Array, "*axes controlled"]
+    off_route: Bool[Array, "*axes controlled"]
+    progression: Float[Array, "*axes controlled"]  # of the lane path, NaN: has none
     counts: Bool[Array, "*axes controlled"]  # recorded, and within the scene
     step: Int[Array, "*axes"]  # t of s_t
-
-
-@dataclass(frozen=True)
-class SceneResult:
-    """One scene's row of an evaluation."""
-
-    id: str
-    objects: int  # controlled objects with at least one counted step
-    valid: int  # (object, step) pairs that count
-    overlap: int  # of them with an overlap
-    offroad: int
-    kinematic_infeasibility: int
-    failed: bool  # any overlap or off-road
-    log_displacement: float  # m, mean over the pairs
-    progress: float | None  # mean over objects that the log moves 1 m or more
 
 
 @dataclass(frozen=True)
@@ -69,31 +64,33 @@ class Evaluation:
     trace: Trace | None  # axes: scenes, steps
 
     @property
+    def figures(self) -> dict[str, Figure]:
+        """Every figure of `results.figures_of`, by name."""
+        return figures_of(self.scenes)
+
+    @property
     def failure_rate(self) -> float:
         """Share of the scenes with an overlap or off-road."""
-        return float(np.mean([scene.failed for scene in self.scenes]))
+        return self.rate("failure")
 
     def rate(self, name: str) -> float:
-        """Share of the scenes in which `overlap` or `offroad` happened."""
-        return float(np.mean([getattr(scene, name) > 0 for scene in self.scenes]))
+        """Share of the scenes in which one of `results.RATES` happened."""
+        return self.figures[f"{name}_rate"].value
 
     @property
     def progress(self) -> float:
         """Mean over the scenes that have one."""
-        values = [s.progress for s in self.scenes if s.progress is not None]
-        return float(np.mean(values)) if values else float("nan")
+        return self.figures["progress"].value
 
     @property
     def log_displacement(self) -> float:
         """Mean over the scenes [m]."""
-        return float(np.mean([scene.log_displacement for scene in self.scenes]))
+        return self.figures["log_displacement"].value
 
     @property
     def infeasible(self) -> float:
         """Share of the counted pairs that are kinematically infeasible."""
-        pairs = sum(scene.valid for scene in self.scenes)
-        total = sum(scene.kinematic_infeasibility for scene in self.scenes)
-        return total / max(pairs, 1)
+        return self.figures["kinematic_infeasibility"].value
 
 
 def evaluate(
@@ -103,7 +100,7 @@ def evaluate(
     name: str,
     key: PRNGKeyArray,
     config: EnvironmentConfig,
-    all_objects: bool = False,
+    controlled: ControlledSet | None = None,
     from_first_step: bool = False,
     keep_trace: bool = False,
 ) -> Evaluation:
@@ -115,20 +112,24 @@ def evaluate(
         name: the agent's, for the results.
         key: for agents that draw.
         config: dynamics, observation and reward.
-        all_objects: control every object instead of the SDC alone.
+        controlled: whom the agent decides for and who of them is judged; by default
+            each scene's SDC.
         from_first_step: start at step 0 and judge it too (playback).
         keep_trace: keep the states for a recording.
     """
     bank = file.bank
-    chunk = 8 if all_objects else 64
-    rollout = _rollout(agent, config, all_objects, from_first_step)
+    chosen = controlled or sdc_of(file)
+    few = 64 if chosen.slots.shape[1] < MANY else 8
+    chunk = min(few, file.scenes)
+    rollout = _rollout(agent, config, chosen.judged, from_first_step)
     results: list[SceneResult] = []
     traces: list[Trace] = []
     for first in range(0, file.scenes, chunk):
         # The last chunk repeats its last scene: one shape, one compilation.
         scenes = np.minimum(np.arange(first, first + chunk), file.scenes - 1)
         keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(scenes)
-        trace = jax.device_get(rollout(keys, bank, jnp.asarray(scenes)))
+        slots = jnp.asarray(chosen.slots[scenes])
+        trace = jax.device_get(rollout(keys, bank, jnp.asarray(scenes), slots))
         kept = min(chunk, file.scenes - first)
         trace = jax.tree.map(lambda values, kept=kept: values[:kept], trace)
         results += [
@@ -143,32 +144,36 @@ def evaluate(
 
 
 def _rollout(
-    agent: Agent, config: EnvironmentConfig, all_objects: bool, from_first_step: bool
-) -> Callable[[PRNGKeyArray, Bank, Int[Array, " scenes"]], Trace]:
-    """The compiled rollout of a batch of scenes; axes of its trace: scenes, steps."""
+    agent: Agent, config: EnvironmentConfig, judged: int, from_first_step: bool
+) -> Callable[..., Trace]:
+    """The compiled rollout of a batch of scenes; axes of its trace: scenes, steps.
 
-    def one(key: PRNGKeyArray, bank: Bank, scene: Int[Array, ""]) -> Trace:
-        if all_objects:
-            controlled = jnp.arange(bank.log.shape[2])
-        else:
-            controlled = bank.sdc[scene][None]
+    The trace holds the first `judged` of the controlled objects.
+    """
+
+    def one(
+        key: PRNGKeyArray,
+        bank: Bank,
+        scene: Int[Array, ""],
+        controlled: Int[Array, " controlled"],
+    ) -> Trace:
         first = jnp.int32(0) if from_first_step else bank.current_step[scene]
         state = start_at(bank, scene, first, controlled, config)
 
         def step(carry: State, step_key: PRNGKeyArray) -> tuple[State, Trace]:
             following, trace = _step(step_key, bank, carry, agent, config)
-            return following, trace
+            return following, _first_slots(trace, judged)
 
         steps = bank.log.shape[1] - 1
         _, trace = jax.lax.scan(step, state, jax.random.split(key, steps))
         if from_first_step:
-            initial = _first(bank, state, trace)
+            initial = _first(bank, _first_slots(state, judged), trace)
             trace = jax.tree.map(
                 lambda head, tail: jnp.concatenate([head[None], tail]), initial, trace
             )
         return trace
 
-    return jax.jit(jax.vmap(one, in_axes=(0, None, 0)))
+    return jax.jit(jax.vmap(one, in_axes=(0, None, 0, 0)))
 
 
 def _step(
@@ -184,6 +189,7 @@ def _step(
     counts = outcome.valid & within
     now = following.history[:, -1]
     logged = logged_states(bank, state.scene, following.step, state.controlled)
+    wrong_way, off_route, progression = _on_route(bank, following)
     infeasible = jax.vmap(metrics.kinematic_infeasibility, in_axes=(0, 0, None))(
         ObjectState(*state.history[:, -1].T), ObjectState(*now.T), config.dt
     )
@@ -203,8 +209,11 @@ def _step(
             0.0,
         ),
         progress=jax.vmap(metrics.progress, in_axes=(None, None, 0, 0))(
-            bank, state.scene, state.controlled, following.along
+            bank, state.scene, row_of(bank, state.controlled), following.along
         ),
+        wrong_way=wrong_way & counts,
+        off_route=off_route & counts,
+        progression=progression,
         counts=counts,
         step=following.step,
     )
@@ -216,33 +225,77 @@ def _first(bank: Bank, state: State, trace: Trace) -> Trace:
     now = state.history[:, -1]
     counts = state.history_valid[:, -1]
     overlap, offroad = failures(bank, state.scene, state.step, state.controlled, now)
+    wrong_way, off_route, progression = _on_route(bank, state)
     empty = jax.tree.map(lambda values: jnp.zeros_like(values[0]), trace)
     return empty._replace(
         states=now,
         action=jnp.full_like(empty.action, -1),
         overlap=overlap & counts,
         offroad=offroad & counts,
-        progress=jnp.zeros_like(empty.progress),
+        wrong_way=wrong_way & counts,
+        off_route=off_route & counts,
+        progression=progression,
         counts=counts,
         step=state.step,
     )
 
 
+def _on_route(
+    bank: Bank, state: State
+) -> tuple[
+    Bool[Array, " controlled"], Bool[Array, " controlled"], Float[Array, " controlled"]
+]:
+    """Wrong-way, off-route and progression of the controlled objects now."""
+    now, rows = state.history[:, -1], row_of(bank, state.controlled)
+    begun = state.step >= bank.current_step[state.scene]
+
+    def one(
+        row: Int[Array, ""], x: Float[Array, ""], y: Float[Array, ""]
+    ) -> tuple[Bool[Array, ""], Bool[Array, ""], Float[Array, ""]]:
+        place = route_metrics.lane_position(bank, state.scene, row, x, y)
+        return (
+            begun & (route_metrics.wrong_way(place) > 0),
+            begun & (route_metrics.off_route(place) > 0),
+            route_metrics.progression(bank, state.scene, row, place.along),
+        )
+
+    return jax.vmap(one)(rows, now[:, 0], now[:, 1])
+
+
+def _first_slots(values: Slots, count: int) -> Slots:
+    """The first of the controlled objects; every array with axes has them in front."""
+    return jax.tree.map(lambda value: value[:count] if value.ndim else value, values)
+
+
 def _result(scene_id: str, trace: Trace, row: int) -> SceneResult:
     counts = trace.counts[row]
     pairs = int(counts.sum())
-    # Of every object, the progress where its recording ended.
-    last = counts.shape[0] - 1 - counts[::-1].argmax(0)
-    final = trace.progress[row][last, np.arange(counts.shape[1])]
-    final = final[counts.any(0) & np.isfinite(final)]
+    happened = {
+        "failure": trace.overlap[row] | trace.offroad[row],
+        **{name: getattr(trace, name)[row] for name in RATES[1:]},
+    }
     return SceneResult(
         id=scene_id,
         objects=int(counts.any(0).sum()),
         valid=pairs,
-        overlap=int(trace.overlap[row].sum()),
-        offroad=int(trace.offroad[row].sum()),
         kinematic_infeasibility=int(trace.infeasible[row].sum()),
-        failed=bool((trace.overlap[row] | trace.offroad[row]).any()),
+        failed=bool(happened["failure"].any()),
+        **{name: int(happened[name].sum()) for name in RATES[1:]},
+        **{
+            f"{name}_objects": int(seen.any(0).sum()) for name, seen in happened.items()
+        },
         log_displacement=float(trace.displacement[row].sum()) / max(pairs, 1),
-        progress=float(final.mean()) if len(final) else None,
+        progress=_final(np.asarray(trace.progress[row]), np.asarray(counts)),
+        progression=_final(np.asarray(trace.progression[row]), np.asarray(counts)),
     )
+
+
+def _final(
+    values: Float[np.ndarray, "steps controlled"],
+    counts: Bool[np.ndarray, "steps controlled"],
+) -> float | None:
+    """Mean of what every object had reached where its recording ended; None: nobody."""
+    last = counts.shape[0] - 1 - counts[::-1].argmax(0)
+    final = values[last, np.arange(counts.shape[1])]
+    final = final[counts.any(0) & np.isfinite(final)]
+    return float(final.mean()) if len(final) else None

@@ -146,13 +146,20 @@ def greedy(
     vector: Float[Array, " parameters"],
     network: NetworkConfig,
     config: EnvironmentConfig,
+    slots: int | None = None,
 ) -> Agent:
-    """Takes the action of the highest Q-value for every controlled object."""
-    return cloned(vector, network, config, components=0)
+    """Takes the action of the highest Q-value for every controlled object.
+
+    With `slots` for the first ones only (`actors.cloning.cloned`).
+    """
+    return cloned(vector, network, config, components=0, slots=slots)
 
 
 def policy_agent(
-    policy: Policy, config: EnvironmentConfig, choice: Choice = "mode"
+    policy: Policy,
+    config: EnvironmentConfig,
+    choice: Choice = "mode",
+    slots: int | None = None,
 ) -> Agent:
     """Drives by a policy, whatever it was trained by; Q-values greedily by default."""
     return cloned(
@@ -161,6 +168,7 @@ def policy_agent(
         config,
         components=policy.mixture,
         choice=choice,
+        slots=slots,
     )
 
 

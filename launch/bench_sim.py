@@ -26,7 +26,7 @@ from launch.bench_sections import ONE_CORE, Sizes
 from launch.bench_steps import STEPS
 from launch.config import write_atomically
 from launch.errors import LaunchError
-from launch.evaluate import printer
+from launch.tables import printer
 
 FORMAT: Final = 1
 Section = Literal["table6", "oracle", "steps", "scale", "banks", "bicycle"]

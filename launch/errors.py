@@ -12,6 +12,7 @@ USER_ERROR: Final = 2
 INTERRUPTED: Final = 130  # as shells report a Ctrl-C
 
 _CLASSES: Final = {
+    "actors.controlled": "ControlledError",
     "actors.frames": "FrameError",
     "actors.policy": "PolicyError",
     "launch.recording": "RecordingError",

@@ -1,207 +1,146 @@
 """`slipstream evaluate`, and the comparison that a run ends with.
 
-Agents by name are the benchmark's (`sim.agents`); anything else is a run, its
+Agents by name are the benchmark's (`launch.drivers`); anything else is a run, its
 checkpoints or one of them. The results of every scene are in the JSON, and the table
 is a summary of them.
 """
 
-import dataclasses
 import itertools
 import json
-import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import jax
-import msgspec
-import numpy as np
-from rich.console import Console
-from rich.table import Table
 
+from actors.controlled import (
+    ControlledSet,
+    all_of,
+    rows_of,
+    sdc_of,
+    tracks_of,
+    with_others,
+)
 from actors.evaluation import Evaluation, evaluate
 from actors.frames import FrameBatch
 from actors.policy import greedy, policy_agent, random_vector, read_policy
-from launch.config import ExperimentConfig, ScenesConfig, quick, write_atomically
+from launch.config import ExperimentConfig, ScenesConfig, write_atomically
+from launch.drivers import PLAYBACK, Driver, built_in, check_step, driver_of
 from launch.errors import LaunchError
 from launch.scenes import bank_of
-from sim.agents import (
-    Agent,
-    ExpertSpace,
-    constant_speed,
-    expert,
-    log_playback,
-    random_actions,
-)
+from launch.tables import markdown_of, printer, scenes_json, summary, table_of, title_of
+from sim.agents import Agent, composite
 from sim.bank import BankFile
-from sim.dynamics import ActionSpace
-from sim.environment import EnvironmentConfig
+from sim.idm import idm
 
-NAMES: Final = ("log", "expert", "constant-speed", "random")
-COLUMNS: Final = (
-    ("failure_rate", "failures", "{:.1%}"),
-    ("overlap_rate", "overlap", "{:.1%}"),
-    ("offroad_rate", "off-road", "{:.1%}"),
-    ("progress", "progress", "{:.2f}"),
-    ("log_displacement", "from log [m]", "{:.2f}"),
-    ("kinematic_infeasibility", "infeasible", "{:.1%}"),
-)
-
-
-def printer() -> Console:
-    """Standard output; wide enough for the table where it is no terminal."""
-    return Console(width=None if sys.stdout.isatty() else 110)
-
-
-def summary(evaluation: Evaluation) -> dict[str, float | int | str | None]:
-    """The figures of an agent; JSON has no NaN, so what there is none of is null."""
-    figures: dict[str, float] = {
-        "failure_rate": evaluation.failure_rate,
-        "overlap_rate": evaluation.rate("overlap"),
-        "offroad_rate": evaluation.rate("offroad"),
-        "progress": evaluation.progress,
-        "log_displacement": evaluation.log_displacement,
-        "kinematic_infeasibility": evaluation.infeasible,
-    }
-    known = {k: v if np.isfinite(v) else None for k, v in figures.items()}
-    return {"agent": evaluation.agent, "scenes": len(evaluation.scenes), **known}
-
-
-def table_of(evaluations: Sequence[Evaluation], title: str) -> Table:
-    """One row per agent."""
-    table = Table(title=title)
-    table.add_column("agent", no_wrap=True)
-    for _, heading, _ in COLUMNS:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for evaluation in evaluations:
-        figures = summary(evaluation)
-        cells = [
-            "-" if figures[name] is None else form.format(figures[name])
-            for name, _, form in COLUMNS
-        ]
-        table.add_row(evaluation.agent, *cells)
-    return table
-
-
-def markdown_of(evaluations: Sequence[Evaluation], title: str) -> str:
-    """The same table for a README."""
-    lines = [f"# {title}", "", "| agent | " + " | ".join(h for _, h, _ in COLUMNS)]
-    lines[-1] += " |"
-    lines.append("|" + "---|" * (len(COLUMNS) + 1))
-    for evaluation in evaluations:
-        figures = summary(evaluation)
-        cells = [
-            "-" if figures[name] is None else form.format(figures[name])
-            for name, _, form in COLUMNS
-        ]
-        lines.append(f"| {evaluation.agent} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def scenes_json(evaluation: Evaluation) -> list[dict[str, Any]]:
-    """Every scene's row."""
-    return [dataclasses.asdict(scene) for scene in evaluation.scenes]
-
-
-def built_in(name: str, environment: EnvironmentConfig) -> Agent:
-    """An agent that needs no learning."""
-    if name == "log":
-        return log_playback()
-    if name == "expert":
-        return expert(environment, ExpertSpace(ActionSpace.BICYCLE, on_grid=False))
-    if name == "constant-speed":
-        return constant_speed(environment)
-    return random_actions(environment)
-
-
-@dataclass(frozen=True)
-class Driver:
-    """An agent with the environment that it knows."""
-
-    name: str
-    agent: Agent
-    environment: EnvironmentConfig
-
-
-def driver_of(name: str) -> Driver:
-    """What `--agent` names."""
-    if name in NAMES:
-        environment = quick().environment
-        return Driver(name, built_in(name, environment), environment)
-    path = Path(name)
-    if not path.exists():
-        raise LaunchError(
-            f"--agent {name}: unknown; one of {', '.join(NAMES)}, or the path of a run "
-            "or a checkpoint"
-        )
-    policy = read_policy(path)
-    try:
-        config = msgspec.convert(policy.extra["config"], ExperimentConfig)
-    except (KeyError, ValueError) as error:
-        raise LaunchError(
-            f"{path}: the checkpoint lacks its run's configuration ({error}); use one "
-            "that `slipstream train` wrote"
-        ) from error
-    policy.check(config.environment, path)
-    agent = policy_agent(policy, config.environment)
-    return Driver(str(path), agent, config.environment)
-
-
-def check_step(bank: BankFile, environment: EnvironmentConfig) -> None:
-    """Refuses scenes of another step length than the agent was made for."""
-    if abs(bank.dt - environment.dt) > 1e-6:
-        raise LaunchError(
-            f"{bank.path}: steps of {bank.dt} s, the agent's are {environment.dt} s; "
-            "use scenes recorded at that rate"
-        )
+COMPARED: Final = ("random", "constant-speed", "idm", "expert")
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateConfig:
-    """Drives scenes with an agent and judges it."""
+    """Drives scenes with one agent or several and judges them."""
 
-    agent: str
-    """expert, constant-speed, random, log (playback), or a run or checkpoint."""
+    agent: tuple[str, ...]
+    """log (playback), expert, expert-delta, expert-bicycle-discrete,
+    expert-delta-discrete, expert-steering, idm, constant-speed, random, or runs or
+    checkpoints."""
     scenes: tuple[str, ...] = ("procedural",)
     """Banks, files or folders of scenes, or `procedural`."""
-    objects: Literal["sdc", "all"] = "sdc"
-    """Which objects the agent controls."""
+    objects: str = "sdc"
+    """Which objects the agent controls: sdc, all, tracks (those that the scene names to
+    predict), or rows of the scenes' objects as I,J,K."""
+    others: Literal["log", "idm"] = "log"
+    """What all other objects do: replay the log, or react by IDM."""
     json: str = ""
     """Writes the results of every scene to this file, or to standard output by -."""
+    markdown: str = ""
+    """Writes the table to this file."""
     count: int = 64
     """Scenes of `procedural`."""
     seed: int = 0
     """Of the procedural scenes and of agents that draw."""
 
 
+SETS: Final = {"sdc": sdc_of, "all": all_of, "tracks": tracks_of}
+
+
+def rows_named(words: str) -> tuple[int, ...]:
+    """The rows that `--objects` names; none where it names a set."""
+    if words in SETS:
+        return ()
+    try:
+        return tuple(int(word) for word in words.split(","))
+    except ValueError as error:
+        raise LaunchError(
+            f"--objects {words}: choose sdc, all, tracks, or rows of objects as 0,3,5"
+        ) from error
+
+
 def evaluate_command(options: EvaluateConfig) -> int:
     """`slipstream evaluate`."""
-    driver = driver_of(options.agent)
+    if not options.agent or len(set(options.agent)) < len(options.agent):
+        raise LaunchError("--agent: name agents, runs or checkpoints, each once")
+    rows = rows_named(options.objects)
+    drivers = [driver_of(name) for name in options.agent]
     config = ScenesConfig(held_out=options.count, seed=options.seed)
     with ExitStack() as keep:
         bank = bank_of(options.scenes, config=config, keep=keep)
-        check_step(bank, driver.environment)
-        result = evaluate(
-            bank,
-            driver.agent,
-            name=driver.name,
-            key=jax.random.key(options.seed),
-            config=driver.environment,
-            all_objects=options.objects == "all",
-            from_first_step=driver.name == "log",
-        )
-    content = {**summary(result), "scenes": scenes_json(result)}
-    text = json.dumps(content, indent=1)
-    if options.json == "-":
-        print(text)
-        return 0
-    if options.json:
-        write_atomically(Path(options.json), (text + "\n").encode())
-    names = ", ".join(options.scenes)
-    printer().print(table_of([result], f"{names}: {bank.scenes} scenes"))
+        chosen = rows_of(bank, rows) if rows else SETS[options.objects](bank)
+        for driver in drivers:
+            check_step(bank, driver.environment)
+        results = [_evaluated(driver, bank, chosen, options) for driver in drivers]
+    _write(results, options)
     return 0
+
+
+def _evaluated(
+    driver: Driver, bank: BankFile, chosen: ControlledSet, options: EvaluateConfig
+) -> Evaluation:
+    """One agent's results."""
+    slots = chosen
+    agent = driver.build(None)
+    if options.others == "idm":
+        slots = with_others(bank, chosen)
+        rest = idm(driver.environment)
+        agent = composite(driver.build(chosen.judged), chosen.judged, rest)
+    return evaluate(
+        bank,
+        agent,
+        name=driver.name,
+        key=jax.random.key(options.seed),
+        config=driver.environment,
+        controlled=slots,
+        from_first_step=driver.name == PLAYBACK,
+    )
+
+
+def _write(results: list[Evaluation], options: EvaluateConfig) -> None:
+    """JSON and markdown where asked for, and the table."""
+    content: dict[str, Any] = _report_json(results)
+    if len(results) == 1:
+        content = {**summary(results[0]), "scenes": scenes_json(results[0])}
+    text = json.dumps(content, indent=1) + "\n"
+    title = title_of(results, ", ".join(options.scenes))
+    if options.markdown:
+        markdown = markdown_of(results, title)
+        write_atomically(Path(options.markdown), markdown.encode())
+    if options.json == "-":
+        print(text, end="")
+        return
+    if options.json:
+        write_atomically(Path(options.json), text.encode())
+    console = printer()
+    console.print(table_of(results, title, width=console.width))
+
+
+def _report_json(results: list[Evaluation]) -> dict[str, Any]:
+    """Several agents: their figures, and every scene's row of each."""
+    return {
+        "agents": [summary(result) for result in results],
+        "scenes": {result.agent: scenes_json(result) for result in results},
+    }
 
 
 def compare(
@@ -217,7 +156,7 @@ def compare(
     drivers: list[tuple[str, Agent]] = [
         ("trained", policy_agent(policy, environment)),
         ("untrained", greedy(untrained, config.network, environment)),
-        *((name, built_in(name, environment)) for name in reversed(NAMES[1:])),
+        *((name, built_in(name, environment)) for name in COMPARED),
     ]
     results = []
     for name, agent in drivers:
@@ -252,16 +191,13 @@ def report(
 ) -> list[Evaluation]:
     """Writes a run's evaluation.json, .md and .rrd, and prints its table."""
     results = compare(config, policy_path, bank)
-    title = f"{bank.scenes} held-out scene{'s' if bank.scenes > 1 else ''}"
-    content = {
-        "agents": [summary(result) for result in results],
-        "scenes": {result.agent: scenes_json(result) for result in results},
-    }
-    text = json.dumps(content, indent=1) + "\n"
+    title = title_of(results, "held out")
+    text = json.dumps(_report_json(results), indent=1) + "\n"
     write_atomically(folder / "evaluation.json", text.encode())
     markdown = markdown_of(results, title)
     write_atomically(folder / "evaluation.md", markdown.encode())
-    printer().print(table_of(results, title))
+    console = printer()
+    console.print(table_of(results, title, width=console.width))
     return results
 
 

@@ -79,20 +79,21 @@ def random_actions(config: EnvironmentConfig) -> Agent:
     def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
         shape = state.controlled.shape
         action = jax.random.randint(key, shape, 0, config.action.count, jnp.int32)
-        return discrete(state, action, jnp.zeros((shape[0], 0), jnp.float32), config)
+        none = jnp.zeros((shape[0], 0), jnp.float32)
+        return discrete(state.history[:, -1], action, none, config)
 
     return act
 
 
 def discrete(
-    state: State,
+    now: Float[Array, "controlled 5"],
     action: Int[Array, " controlled"],
     q_values: Float[Array, "controlled actions"],
     config: EnvironmentConfig,
 ) -> Decision:
-    """The decision that an index of the grid leads to."""
+    """The decision that an index of the grid leads to from the objects' states."""
     moved = jax.vmap(dynamics.apply_discrete, in_axes=(0, 0, None, None))(
-        ObjectState(*state.history[:, -1].T), action, config.action, config.dt
+        ObjectState(*now.T), action, config.action, config.dt
     )
     return Decision(jnp.stack(moved, -1), action, q_values)
 
@@ -132,17 +133,18 @@ def expert(config: EnvironmentConfig, through: ExpertSpace) -> Agent:
 def composite(driver: Agent, slots: int, others: Agent) -> Agent:
     """The first `slots` controlled objects as `driver` decides, the rest as `others`.
 
-    Both are asked for all objects, so that each sees where all of them are.
+    Both see the whole scene; the driver may decide for the first ones only.
     """
 
     def act(key: PRNGKeyArray, bank: Bank, state: State) -> Decision:
         own_key, others_key = jax.random.split(key)
         own, rest = driver(own_key, bank, state), others(others_key, bank, state)
-        mine = jnp.arange(state.controlled.shape[0]) < slots
+        q_values = own.q_values[:slots]
+        none = jnp.zeros((rest.moved.shape[0] - slots, q_values.shape[1]))
         return Decision(
-            moved=jnp.where(mine[:, None], own.moved, rest.moved),
-            action=jnp.where(mine, own.action, rest.action),
-            q_values=own.q_values,
+            moved=jnp.concatenate([own.moved[:slots], rest.moved[slots:]]),
+            action=jnp.concatenate([own.action[:slots], rest.action[slots:]]),
+            q_values=jnp.concatenate([q_values, none]),
         )
 
     return act

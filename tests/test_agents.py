@@ -137,7 +137,7 @@ def test_a_discrete_decision_is_the_environments_step(file: BankFile) -> None:
     step = jax.jit(environment.step, static_argnums=3)
     stepped, _ = step(file.bank, state, action, CONFIG)
     decided = jax.jit(agents.discrete, static_argnums=3)(
-        state, action, jnp.zeros((OBJECTS, 0)), CONFIG
+        state.history[:, -1], action, jnp.zeros((OBJECTS, 0)), CONFIG
     )
     follows = np.asarray(stepped.history_valid[:, -1] & state.history_valid[:, -1])
     assert follows.any()

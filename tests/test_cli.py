@@ -75,6 +75,12 @@ def test_a_person_without_a_command_gets_the_list(
         (["train", "dqn", "--run", "new", "--scenes", "nowhere"], "no such file"),
         (["evaluate", "--agent", "ghost"], "unknown; one of log, expert"),
         (["evaluate"], "--agent"),
+        (["evaluate", "--agent", "log", "log"], "each once"),
+        (
+            ["evaluate", "--agent", "log", "--objects", "some"],
+            "choose sdc, all, tracks",
+        ),
+        (["evaluate", "--agent", "log", "--others", "ghost"], "ghost"),
         (["evaluate", "--agent", "expert", "--scenes", "nowhere"], "no such file"),
         (["scenes", "procedural", "--count", "0", "--out", "x"], "must be at least 1"),
         (["scenes", "info", "nowhere"], "no such file"),
@@ -210,12 +216,38 @@ def test_evaluation_counts_every_scene(
         assert "failures" in capsys.readouterr().out
         result = json.loads(out.read_text())
         assert result["agent"] == "log" and len(result["scenes"]) == 2
+        assert result["intervals_95"]["overlap_rate"][0] == 0.0
+        assert ("object_failure_rate" in result) == (objects == "all")
         rows[objects] = result["scenes"]
     for ours, every in zip(rows["sdc"], rows["all"], strict=True):
         assert ours["id"] == every["id"] and ours["objects"] == 1
         # The generator's cars collide with nothing and stay on the road.
         assert ours["overlap"] == ours["offroad"] == every["overlap"] == 0
         assert every["valid"] > ours["valid"] and every["objects"] > 1
+        assert ours["wrong_way"] == ours["off_route"] == 0
+        assert ours["progression"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_several_agents_share_a_table(
+    bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["evaluate", "--agent", "log", "constant-speed", "--scenes", str(bank)]
+    json_file, markdown = tmp_path / "f.json", tmp_path / "f.md"
+    files = ["--json", str(json_file), "--markdown", str(markdown)]
+    assert main([*words, *files, "--objects", "1,0"]) == 0
+    table = capsys.readouterr().out
+    assert "2 scenes, rates of 4 objects" in table
+    content = json.loads(json_file.read_text())
+    assert [one["agent"] for one in content["agents"]] == ["log", "constant-speed"]
+    assert [scene["objects"] for scene in content["scenes"]["log"]] == [2, 2]
+    lines = [line for line in markdown.read_text().splitlines() if line[:1] == "|"]
+    for name in ("off-road", "overlap", "log ADE", "progression", "wrong-way"):
+        assert name in table and name in lines[0]
+    rows = [line.split("|")[1].strip() for line in lines[2:]]
+    assert rows == ["log", "constant-speed"]
+    assert "0.0% [0.0, " in lines[2]
+    line = refusal(capsys, *words, "--objects", "0,99")
+    assert "99 is none" in line
 
 
 def test_info_tells_a_bank(bank: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 
+from actors.controlled import all_of
 from actors.evaluation import Evaluation, evaluate
 from sim import agents
 from sim.bank import BankFile
@@ -26,7 +27,7 @@ def playback(file: BankFile) -> Evaluation:
         name="log",
         key=jax.random.key(KEY),
         config=CONFIG,
-        all_objects=True,
+        controlled=all_of(file),
         from_first_step=True,
         keep_trace=True,
     )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim import agents, environment
+from sim import environment
 from sim.agents import Agent
 from sim.bank import BankFile
 from sim.environment import EnvironmentConfig
@@ -305,6 +305,7 @@ def test_empty_slots_drive_nowhere_and_break_nothing(tmp_path: Path) -> None:
     np.testing.assert_allclose(every[:, :3], some, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_generated_traffic_reacts_without_a_crash_from_behind(tmp_path: Path) -> None:
     """All objects driven: speeds stay speeds, nobody is driven backwards."""
     file = scenes.bank_of(list(generate_many(5, 1)), tmp_path)
@@ -315,19 +316,3 @@ def test_generated_traffic_reacts_without_a_crash_from_behind(tmp_path: Path) ->
     heading = np.stack([np.cos(states[:-1, :, 2]), np.sin(states[:-1, :, 2])], -1)
     vehicle = file.arrays["object_type"][0] == ObjectType.VEHICLE
     assert (way * heading).sum(-1)[:, vehicle[:objects]].min() > -0.05
-
-
-def test_a_composite_drives_its_slots_by_the_one_and_the_rest_by_the_other(
-    tmp_path: Path,
-) -> None:
-    drivers = [
-        scenes.driver(speed=10.0, steps=STEPS),
-        scenes.driver(x=30.0, speed=4.0, steps=STEPS),
-    ]
-    file = road(drivers, tmp_path)
-    agent = agents.composite(agents.constant_speed(CONFIG), 1, IDM)
-    states = drive(file, [1, 0], agent=agent)
-    np.testing.assert_allclose(speed(states)[:, 0], 4.0, atol=1e-3)
-    assert speed(states)[-1, 1] == pytest.approx(4.0, abs=0.05)  # behind it, by IDM
-    gap = states[:, 0, 0] - states[:, 1, 0] - scenes.LENGTH
-    assert gap.min() > 1.0
