@@ -209,6 +209,6 @@ def test_greedy_takes_the_highest_q_value_of_every_object(tmp_path: Path) -> Non
     np.testing.assert_allclose(decision.q_values, jax.jit(q_values)(state), atol=1e-5)
     np.testing.assert_array_equal(decision.action, decision.q_values.argmax(1))
     moved = jax.jit(discrete, static_argnums=3)(
-        state, decision.action, decision.q_values, CONFIG
+        state.history[:, -1], decision.action, decision.q_values, CONFIG
     ).moved
     np.testing.assert_allclose(decision.moved, moved, atol=1e-5)
