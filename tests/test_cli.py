@@ -190,7 +190,7 @@ def test_a_checkpoint_of_another_network(
 
     config = quick()
     path = save_checkpoint(
-        tmp_path, learner=make_learner(config), extra=checkpoint_extra(config, 0.0)
+        tmp_path, learner=make_learner(config), extra=checkpoint_extra(config, 0.0, {})
     )
     words = ("evaluate", "--agent", tmp_path, "--scenes", bank, "--json", "-")
     assert main([str(word) for word in words]) == 0
