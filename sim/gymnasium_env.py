@@ -259,11 +259,9 @@ class _Simulator:
             self._config,
         )
         self._state = result.state
-        reward, terminated, truncated = (
-            np.array(result.reward, np.float64),
-            np.array(result.terminated),
-            np.array(result.truncated),
-        )
+        reward = np.array(result.reward, np.float64)
+        terminated = np.array(result.terminated)
+        truncated = np.array(result.truncated)
         if self._restarts:
             self._over = terminated | truncated
         observation = _as_numpy(result.observation)
