@@ -12,7 +12,7 @@ from rich.table import Table
 from actors.evaluation import Evaluation
 from actors.results import Figure
 
-WIDE: Final = 140  # columns of a terminal from which on the intervals have room
+WIDE: Final = 156  # columns of a terminal from which on the intervals have room
 _SHARE: Final = "{:.1%}"
 COLUMNS: Final = (
     ("failure_rate", "failures", _SHARE),

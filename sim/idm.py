@@ -25,7 +25,7 @@ Beyond the model:
   that it starts with decay with the way driven.
 
 Who is not driven so: pedestrians, and whoever moves backwards along its route, replay
-the log; objects whose log never moves 1 m stay.
+the log; objects whose log never moves 1 m stay, unless they stand on a lane.
 """
 
 from dataclasses import dataclass, field
@@ -35,7 +35,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from sim import paths
+from sim import paths, route_metrics
 from sim.agents import Agent, Decision, continuous, next_logged
 from sim.bank import Bank
 from sim.dynamics import wrap
@@ -76,6 +76,8 @@ class IdmConfig:
     """Lights and stop signs."""
     margin: float = 0.2
     """The corridor's, on both sides of the own box [m]."""
+    in_lane: float = 1.0
+    """Who stands throughout the log within this of a lane [m] waits; others park."""
     same_level: float = 3.0
     """Objects with more between their heights [m] are on another road."""
     slab: float = 2.5
@@ -212,12 +214,25 @@ def _drive(
         _behind(own, others, index, corridor, model), _before(own, line, model)
     )
     acceleration = jnp.maximum(acceleration, -model.hardest_braking)
-    # Parked, as far as the log tells.
-    parked = bank.route_end[scene, index] < 1.0
+    parked = _parked(bank, scene, index, now, model)
     acceleration = jnp.where(parked, -own.speed / dt, acceleration)
     moved = _moved(path, own, acceleration, model, dt)
     on_foot = bank.object_type[scene, index] == int(ObjectType.PEDESTRIAN)
     return moved, on_foot | (jnp.abs(own.angle) > jnp.pi / 2)
+
+
+def _parked(
+    bank: Bank,
+    scene: Int[Array, ""],
+    index: Int[Array, ""],
+    now: Float[Array, "5"],
+    model: IdmConfig,
+) -> Bool[Array, ""]:
+    """Whether the log never moves it and it stands on none of its lanes."""
+    lane = route_metrics.lane_position(bank, scene, index, now[0], now[1])
+    known = (bank.path_flags[scene, index] > 0).any()
+    on_lane = known & (lane.lane_distance <= model.in_lane)
+    return (bank.route_end[scene, index] < 1.0) & ~on_lane
 
 
 def _corridor(path: Path, own: Own, model: IdmConfig) -> Corridor:

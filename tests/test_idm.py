@@ -15,7 +15,14 @@ from sim.bank import BankFile
 from sim.environment import EnvironmentConfig
 from sim.idm import IdmConfig, ballistic, free_road, idm, interaction
 from sim.procedural import generate_many
-from sim.scene import LightState, ObjectType, Scene, TrafficLights
+from sim.scene import (
+    LightState,
+    ObjectType,
+    Polyline,
+    RoadKind,
+    Scene,
+    TrafficLights,
+)
 from tests import scenes
 
 CONFIG = EnvironmentConfig()
@@ -236,6 +243,32 @@ def test_at_a_stop_sign_it_stands_then_goes(tmp_path: Path) -> None:
     assert 0.0 < 70.0 - front[slow].max() < MODEL.stop.zone
     assert front[-1] > 100.0
     assert np.abs(np.diff(slow.astype(int))).sum() == 2  # it stops once
+
+
+@pytest.mark.slow
+def test_a_stop_sign_holds_and_who_stands_on_a_lane_is_not_parked(
+    tmp_path: Path,
+) -> None:
+    """A limit of 10 m/s, a sign 70 m along; a car stands on the lane, one beside it."""
+    line = np.stack([np.arange(-150.0, 700.0, 5.0), *np.zeros((2, 170))], -1)
+    lane = Polyline(RoadKind.LANE_STREET, line, feature_id=7, speed_limit=10.0)
+    sign = Polyline(RoadKind.STOP_SIGN, np.array([[70.0, -4.0, 0.0]]), stop_lanes=(7,))
+    drivers = [
+        scenes.driver(speed=8.0, steps=STEPS),
+        scenes.driver(x=-100.0, speed=0.0, steps=STEPS),
+        scenes.driver(x=-100.0, y=-4.0, speed=0.0, steps=STEPS),
+    ]
+    roads = [*scenes.corridor(half=70.0, start=-200.0, end=800.0), lane, sign]
+    file = scenes.bank_of([scenes.scene_of(drivers, roads=roads)], tmp_path)
+    states = drive(file, [0, 1, 2])
+    pace, front = speed(states), states[..., 0] + scenes.LENGTH / 2
+    slow = pace[:, 0] < 0.1
+    assert slow.any()
+    assert 0.0 < 70.0 - front[slow, 0].max() < MODEL.stop.zone
+    assert front[-1, 0] > 100.0
+    assert pace[:, 0].max() < 10.1
+    assert front[-1, 1] > -60.0
+    np.testing.assert_allclose(pace[:, 2], 0.0, atol=1e-6)
 
 
 def test_a_platoon_damps_what_its_leader_does(tmp_path: Path) -> None:
