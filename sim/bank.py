@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 MAGIC = b"SLIPBANK"
-VERSION = 3
+VERSION = 4
 ALIGNMENT = 4096
 
 
@@ -72,6 +72,7 @@ class Bank(NamedTuple):
     segment_start: Int[Array, " scenes"]  # first row of `segments`
     segments: Float[Array, "segments 4"]  # m, x0 y0 x1 y1
     segment_kind: Int[Array, " segments"]  # `RoadKind`
+    segment_rows: Float[Array, "segments 11"]  # `sim.tables.segment_rows`
     cell_edges: Int[Array, " cells"]  # -1 drivable, -2 not, else row of `fine_state`
     fine_start: Int[Array, " scenes"]  # first row of `fine_state`; rows are the scene's
     fine_state: Int[Array, "mixed parts"]  # -1, -2, else list of candidates

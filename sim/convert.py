@@ -57,6 +57,9 @@ def convert(scene: Scene) -> Converted:
         "grid_shape": np.array(grid.shape, np.int32),
         "segments": (segments - np.tile(origin[:2], 2)).astype(np.float32),
         "segment_kind": kinds,
+        "segment_rows": tables.segment_rows(
+            segments - np.tile(origin[:2], 2), kinds
+        ).astype(np.float32),
         "cell_row": row_of,
         "rows": rows,
         "row_count": counts,

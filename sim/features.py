@@ -5,9 +5,12 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sim import smallest, tables
 from sim.bank import Bank
 from sim.metrics import route_position
 from sim.scene import LightState
@@ -115,68 +118,96 @@ def route_features(
 
 
 def agent_features(
-    world: World,
-    kind: Int[Array, " objects"],
-    own: Int[Array, ""],
+    seen: World, used: Bool[Array, " neighbours"], frame: Frame
+) -> Float[Array, "neighbours agent"]:
+    """The chosen objects seen from the object; 0 where a slot is not used.
+
+    Columns, for each state oldest first: x, y, cos, sin, v_x, v_y, 1; then length,
+    width and whether it is a vehicle, pedestrian, cyclist.
+
+    A product with a small matrix: measured 0.34 us per observer, 0.56 with the columns
+    worked out one by one, 1.35 with all of them at once beside their partners.
+    """
+    neighbours = used.shape[0]
+    zero, one = jnp.zeros(()), jnp.ones(())
+    origin = jnp.stack([frame.x, frame.y, zero, zero, zero, zero])
+    cos, sin = frame.cos, frame.sin
+    turns = []
+    for pair, scale in enumerate((POSITION_SCALE, 1.0, SPEED_SCALE)):
+        c, s = cos / scale, sin / scale
+        turns.append(jnp.stack([zero] * (2 * pair) + [c, -s] + [zero] * (5 - 2 * pair)))
+        turns.append(jnp.stack([zero] * (2 * pair) + [s, c] + [zero] * (5 - 2 * pair)))
+    turned = jnp.matmul(
+        (seen.motion - origin[None, None]).reshape(-1, 6),
+        jnp.stack(turns),
+        precision=jax.lax.Precision.HIGHEST,
+    )
+    there = jnp.stack([zero] * 6 + [one])[None]
+    shown = (seen.valid & used[:, None]).reshape(-1, 1)
+    motion = jnp.where(shown, turned + there, 0.0).reshape(neighbours, -1)
+    kinds = seen.kind[:, None] == jnp.array([1, 2, 3], seen.kind.dtype)[None]
+    fixed = jnp.concatenate([seen.size / SIZE_SCALE, kinds.astype(jnp.float32)], -1)
+    return jnp.concatenate([motion, jnp.where(used[:, None], fixed, 0.0)], -1)
+
+
+def nearest_agents(
+    x: Float[Array, " objects"],
+    y: Float[Array, " objects"],
+    there: Bool[Array, " objects"],
     frame: Frame,
     neighbours: int,
     radius: Float[Array, ""],
-) -> tuple[Float[Array, "neighbours agent"], Bool[Array, " neighbours"]]:
-    """The valid others nearest to object `own` within `radius`, and their slots."""
-    x, y = world.state[-1, :, 0] - frame.x, world.state[-1, :, 1] - frame.y
+) -> tuple[Int[Array, " neighbours"], Bool[Array, " neighbours"]]:
+    """The objects that are there within `radius`, nearest first, and the slots used."""
+    x, y = x - frame.x, y - frame.y
     squared = x * x + y * y
-    seen = world.valid[-1] & (squared < radius**2)
-    seen = seen & (jnp.arange(squared.shape[0]) != own)
-    chosen, valid = nearest(squared, seen, neighbours)
-    state = world.state[:, chosen]
-    there = (world.valid[:, chosen] & valid[None])[..., None]
-    x, y = frame.place(state[..., 0], state[..., 1])
-    v_x, v_y = frame.turn(state[..., 3], state[..., 4])
-    cos, sin = frame.turn(jnp.cos(state[..., 2]), jnp.sin(state[..., 2]))
-    motion = jnp.stack(
-        [
-            x / POSITION_SCALE,
-            y / POSITION_SCALE,
-            cos,
-            sin,
-            v_x / SPEED_SCALE,
-            v_y / SPEED_SCALE,
-            jnp.ones_like(x),
-        ],
-        -1,
-    )
-    motion = jnp.where(there, motion, 0.0).transpose(1, 0, 2)
-    size, kind = world.size[chosen], kind[chosen]
-    fixed = jnp.stack(
-        [
-            size[:, 0] / SIZE_SCALE,
-            size[:, 1] / SIZE_SCALE,
-            *((kind == k).astype(jnp.float32) for k in (1, 2, 3)),
-        ],
-        -1,
-    )
-    features = jnp.concatenate([motion.reshape(neighbours, -1), fixed], -1)
-    return jnp.where(valid[:, None], features, 0.0), valid
+    return smallest.nearest(squared, there & (squared < radius**2), neighbours)
 
 
-def nearest(
-    squared: Float[Array, " objects"], seen: Bool[Array, " objects"], count: int
-) -> tuple[Int[Array, " count"], Bool[Array, " count"]]:
-    """The `count` seen objects nearest first, ties by index; and which slots are used.
+def cell_of(
+    bank: Bank, scene: Int[Array, ""], x: Float[Array, ""], y: Float[Array, ""]
+) -> Int[Array, ""]:
+    """The number of a point's cell; outside the grid, the nearest cell's."""
+    shape = bank.grid_shape[scene]
+    point = jnp.stack([x, y])
+    cell = ((point - bank.grid_origin[scene]) / tables.CELL).astype(jnp.int32)
+    cell = jnp.clip(cell, 0, shape - 1)
+    return bank.cell_start[scene] + cell[0] * shape[1] + cell[1]
 
-    Ranks by counting how many are nearer: dense comparisons vectorise, a sort or
-    `top_k` does not (measured on a CPU: several times slower up to 128 objects).
+
+def road_features(
+    bank: Bank,
+    scene: Int[Array, ""],
+    there: Bool[Array, ""],
+    frame: Frame,
+    rows: int,
+) -> tuple[Float[Array, "rows road"], Bool[Array, " rows"]]:
+    """The segments of the object's cell, nearest to its centre first, if it is there.
+
+    Measured: with the ends, lengths and classes worked out for every row 0.55 us per
+    object, from ready `segment_rows` 0.28; a second table for the exchanged columns
+    0.53.
     """
-    objects = squared.shape[0]
-    key = jnp.where(seen, squared, jnp.inf)
-    index = jnp.arange(objects)
-    nearer = (key[None] < key[:, None]) | (
-        (key[None] == key[:, None]) & (index[None] < index[:, None])
+    row = bank.cell_row[cell_of(bank, scene, frame.x, frame.y)]
+    row, has_row = jnp.maximum(row, 0), row >= 0
+    valid = jnp.arange(rows) < bank.row_count[row].astype(jnp.int32)
+    valid = valid & has_row & there
+    near = bank.rows[row, :rows].astype(jnp.int32) + bank.segment_start[scene]
+    segment = bank.segment_rows[near]
+    zero = jnp.zeros(())
+    x, y = frame.x, frame.y
+    cos, sin = frame.cos, frame.sin
+    scale = POSITION_SCALE
+    origin = jnp.stack([x, y, zero, zero])[None]
+    crossed = jnp.stack([y, x, zero, zero])[None]
+    straight = jnp.stack([cos / scale, cos / scale, cos, cos])[None]
+    across = jnp.stack([sin / scale, -sin / scale, sin, -sin])[None]
+    turned = (segment[:, :4] - origin) * straight
+    turned += (segment[:, np.array([1, 0, 3, 2])] - crossed) * across
+    features = jnp.concatenate(
+        [turned, segment[:, 4:5] / SIZE_SCALE, segment[:, 5:]], -1
     )
-    rank = nearer.sum(1)
-    match = rank[None] == jnp.arange(count)[:, None]
-    chosen = jnp.where(match, index[None], 0).sum(1)
-    return chosen, (match & seen[None]).any(1)
+    return jnp.where(valid[:, None], features, 0.0), valid
 
 
 def light_features(
@@ -192,7 +223,7 @@ def light_features(
     x, y = position[:, 0] - frame.x, position[:, 1] - frame.y
     squared = x * x + y * y
     seen = (jnp.arange(squared.shape[0]) < bank.lights[scene]) & (squared < radius**2)
-    chosen, valid = nearest(squared, seen, count)
+    chosen, valid = smallest.nearest(squared, seen, count)
     x, y = frame.place(position[chosen, 0], position[chosen, 1])
     light = _light_class(bank.light_state[scene, step, chosen].astype(jnp.int32))
     one_hot = light[:, None] == jnp.arange(LIGHT_CLASSES)[None]

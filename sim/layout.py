@@ -45,6 +45,7 @@ TABLES = (
     "row_count",
     "segments",
     "segment_kind",
+    "segment_rows",
     "chunks",
     "cell_edges",
     "fine_state",

@@ -19,6 +19,7 @@ are 0.
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,22 +28,21 @@ import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Bool, Float, Int
 
-from sim import tables
 from sim.bank import Bank
 from sim.features import (
     AGENT_FEATURES,
     AGENT_STEP_FEATURES,
     LIGHT_CLASSES,
-    POSITION_SCALE,
-    SIZE_SCALE,
     Frame,
     agent_features,
     light_features,
+    nearest_agents,
     own_features,
+    road_features,
     route_features,
 )
-from sim.scene import RoadKind
-from sim.world import View, World, exists, row_of, world_of
+from sim.tables import ROAD_CLASSES
+from sim.world import View, World, exists, logged_world, row_of, world_of
 
 
 @dataclass(frozen=True)
@@ -109,40 +109,46 @@ def observation_sizes(config: ObservationConfig) -> ObservationSizes:
     )
 
 
-ROAD_CLASSES = ("lane", "line", "edge", "stop sign", "crosswalk", "speed bump")
-
-
-def _road_class(kind: Int[Array, "..."]) -> Int[Array, "..."]:
-    """Index into `ROAD_CLASSES`; kinds are ordered so that bounds decide."""
-    bounds = (
-        RoadKind.LINE_UNKNOWN,
-        RoadKind.EDGE_UNKNOWN,
-        RoadKind.STOP_SIGN,
-        RoadKind.CROSSWALK,
-        RoadKind.SPEED_BUMP,
-    )
-    result = jnp.zeros_like(kind)
-    for bound in bounds:
-        result = result + (kind >= int(bound)).astype(kind.dtype)
-    return result
-
-
 def observe(bank: Bank, view: View, config: ObservationConfig) -> Observation:
     """What each controlled object of one scene sees; axis `controlled` in front.
 
     They see one another where they are simulated and all others where the log has
     them. An empty slot sees nothing: all is 0 and masked.
     """
-    world = world_of(bank, view)
-    one = functools.partial(_observe_one, bank, view.scene, view.step, world, config)
+    if view.controlled.shape[0] == 1:
+        # Nobody but itself sees where it is simulated: of the others, only those that
+        # it sees are read.
+        def seen(chosen: Int[Array, " neighbours"]) -> World:
+            return logged_world(bank, view, chosen)
+
+        log = bank.log[view.scene, view.step]
+        x, y, there = log[:, 0], log[:, 1], bank.log_valid[view.scene, view.step]
+    else:
+        world = world_of(bank, view)
+
+        def seen(chosen: Int[Array, " neighbours"]) -> World:
+            return World(*(value[chosen] for value in world))
+
+        x, y, there = world.motion[:, -1, 0], world.motion[:, -1, 1], world.valid[:, -1]
+    others = Others(x, y, there, seen)
+    one = functools.partial(_observe_one, bank, view.scene, view.step, others, config)
     return jax.vmap(one)(view.controlled, view.history, view.history_valid)
+
+
+class Others(NamedTuple):
+    """All objects of a scene now, and the last states of some of them."""
+
+    x: Float[Array, " objects"]  # m
+    y: Float[Array, " objects"]
+    there: Bool[Array, " objects"]
+    seen: Callable[[Int[Array, " some"]], World]
 
 
 def _observe_one(
     bank: Bank,
     scene: Int[Array, ""],
     step: Int[Array, ""],
-    world: World,
+    others: Others,
     config: ObservationConfig,
     controlled: Int[Array, ""],
     history: Float[Array, "history 5"],
@@ -151,89 +157,33 @@ def _observe_one(
     there, own = exists(bank, controlled), row_of(bank, controlled)
     now = history[-1]
     frame = Frame(now[0], now[1], jnp.cos(now[2]), jnp.sin(now[2]))
-    agents, agents_valid = agent_features(
-        world,
-        bank.object_type[scene],
-        own,
+    radius = jnp.where(there, config.radius, 0.0)
+    chosen, agents_valid = nearest_agents(
+        others.x,
+        others.y,
+        others.there & (jnp.arange(others.x.shape[0]) != controlled),
         frame,
-        neighbours=config.neighbours,
-        radius=jnp.where(there, config.radius, 0.0),
+        config.neighbours,
+        radius,
     )
-    road, road_valid = _road(bank, scene, there, frame, config)
+    road, road_valid = road_features(bank, scene, there, frame, config.road_rows)
     lights, lights_valid = light_features(
-        bank,
-        scene,
-        step,
-        frame,
-        count=config.lights,
-        radius=jnp.where(there, config.radius, 0.0),
+        bank, scene, step, frame, config.lights, radius
     )
     route = route_features(
-        bank,
-        scene,
-        own,
-        now,
-        frame,
-        points=config.route_points,
-        gap=config.route_gap,
+        bank, scene, own, now, frame, config.route_points, config.route_gap
     )
-    ego = own_features(history, history_valid, world.size[own], frame)
+    size = bank.log[scene, step, own, 6:8]
+    ego = jnp.concatenate([own_features(history, history_valid, size, frame), route])
     return Observation(
-        ego=jnp.where(there, jnp.concatenate([ego, route]), 0.0),
-        agents=agents,
+        ego=jnp.where(there, ego, 0.0),
+        agents=agent_features(others.seen(chosen), agents_valid, frame),
         agents_valid=agents_valid,
         road=road,
         road_valid=road_valid,
         lights=lights,
         lights_valid=lights_valid,
     )
-
-
-def cell_of(
-    bank: Bank, scene: Int[Array, ""], x: Float[Array, ""], y: Float[Array, ""]
-) -> Int[Array, ""]:
-    """The number of a point's cell; outside the grid, the nearest cell's."""
-    shape = bank.grid_shape[scene]
-    point = jnp.stack([x, y])
-    cell = ((point - bank.grid_origin[scene]) / tables.CELL).astype(jnp.int32)
-    cell = jnp.clip(cell, 0, shape - 1)
-    return bank.cell_start[scene] + cell[0] * shape[1] + cell[1]
-
-
-def _road(
-    bank: Bank,
-    scene: Int[Array, ""],
-    there: Bool[Array, ""],
-    frame: Frame,
-    config: ObservationConfig,
-) -> tuple[Float[Array, "rows road"], Bool[Array, " rows"]]:
-    cell = cell_of(bank, scene, frame.x, frame.y)
-    rows = config.road_rows
-    row = bank.cell_row[cell]
-    near = bank.rows[jnp.maximum(row, 0), :rows].astype(jnp.int32)
-    near = near + bank.segment_start[scene]
-    valid = jnp.arange(rows) < bank.row_count[jnp.maximum(row, 0)].astype(jnp.int32)
-    valid = valid & (row >= 0) & there
-    segment = bank.segments[near]
-    x0, y0 = frame.place(segment[:, 0], segment[:, 1])
-    x1, y1 = frame.place(segment[:, 2], segment[:, 3])
-    dx, dy = x1 - x0, y1 - y0
-    length = jnp.hypot(dx, dy)
-    norm = jnp.maximum(length, 1e-6)
-    kind = _road_class(bank.segment_kind[near].astype(jnp.int32))
-    one_hot = kind[:, None] == jnp.arange(len(ROAD_CLASSES))[None]
-    geometry = jnp.stack(
-        [
-            (x0 + x1) / (2 * POSITION_SCALE),
-            (y0 + y1) / (2 * POSITION_SCALE),
-            dx / norm,
-            dy / norm,
-            length / SIZE_SCALE / 2,
-        ],
-        -1,
-    )
-    features = jnp.concatenate([geometry, one_hot.astype(jnp.float32)], -1)
-    return jnp.where(valid[:, None], features, 0.0), valid
 
 
 def observe_batch(bank: Bank, view: View, config: ObservationConfig) -> Observation:

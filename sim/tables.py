@@ -31,6 +31,8 @@ ROW_KINDS = (
     *(kind for kind in RoadKind if 5 <= kind <= 19),
 )
 
+ROAD_CLASSES = ("lane", "line", "edge", "stop sign", "crosswalk", "speed bump")
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -86,6 +88,36 @@ def row_segments(
     if not ends:
         return np.zeros((0, 4)), np.zeros(0, np.int8)
     return np.concatenate(ends), np.concatenate(kinds)
+
+
+def segment_rows(
+    segments: Float[np.ndarray, "segments 4"], kinds: Int[np.ndarray, " segments"]
+) -> Float[np.ndarray, "segments 11"]:
+    """What is seen of each segment, in the map's frame.
+
+    Columns: the middle x, y [m], the unit direction, the half length [m], and one
+    column for each of `ROAD_CLASSES`.
+    """
+    along = segments[:, 2:] - segments[:, :2]
+    length = np.hypot(*along.T)
+    # Kinds are ordered so that bounds decide.
+    bounds = (
+        RoadKind.LINE_UNKNOWN,
+        RoadKind.EDGE_UNKNOWN,
+        RoadKind.STOP_SIGN,
+        RoadKind.CROSSWALK,
+        RoadKind.SPEED_BUMP,
+    )
+    classes = np.searchsorted([int(bound) for bound in bounds], kinds, side="right")
+    return np.concatenate(
+        [
+            (segments[:, :2] + segments[:, 2:]) / 2,
+            along / np.maximum(length, 1e-6)[:, None],
+            length[:, None] / 2,
+            classes[:, None] == np.arange(len(ROAD_CLASSES)),
+        ],
+        -1,
+    )
 
 
 def keep_points(

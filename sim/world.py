@@ -24,34 +24,47 @@ class View(NamedTuple):
 
 
 class World(NamedTuple):
-    """The last H states of all objects, oldest first; map frame."""
+    """The last H states of some or all objects, oldest first; map frame."""
 
-    state: Float[Array, "history objects 5"]  # x, y [m], yaw [rad], v_x, v_y [m/s]
-    valid: Bool[Array, "history objects"]
+    motion: Float[Array, "objects history 6"]  # x, y [m], cos, sin, v_x, v_y [m/s]
+    valid: Bool[Array, "objects history"]
     size: Float[Array, "objects 2"]  # m, length and width now
+    kind: Int[Array, " objects"]  # `ObjectType`
+
+
+def logged_world(bank: Bank, view: View, rows: Int[Array, " objects"]) -> World:
+    """Some objects as the log has them; nothing is valid before its first step."""
+    length = view.history.shape[1]
+    wanted = view.step - jnp.arange(length - 1, -1, -1)
+    steps = jnp.maximum(wanted, 0)[None]
+    log = bank.log[view.scene, steps, rows[:, None]]
+    return World(
+        motion=_motion(log[..., :2], log[..., 3], log[..., 4:6]),
+        valid=bank.log_valid[view.scene, steps, rows[:, None]] & (wanted >= 0)[None],
+        size=log[:, -1, 6:8],
+        kind=bank.object_type[view.scene, rows],
+    )
 
 
 def world_of(bank: Bank, view: View) -> World:
-    """The log's last H steps, each controlled object where it was simulated.
-
-    Before the recording's first step nothing is valid.
-    """
-    length = view.history.shape[1]
-    wanted = view.step - jnp.arange(length - 1, -1, -1)
-    steps = jnp.maximum(wanted, 0)
-    log = bank.log[view.scene, steps]
-    state = jnp.concatenate([log[..., :2], log[..., 3:6]], -1)
-    valid = bank.log_valid[view.scene, steps] & (wanted >= 0)[:, None]
-    size = log[-1, :, 6:8]
-    if view.controlled.shape[0] == 1:
-        # Nobody but itself sees where it is, and itself it does not look up here.
-        return World(state, valid, size)
-    own = view.controlled
-    return World(
-        state.at[:, own].set(view.history.transpose(1, 0, 2), mode="drop"),
-        valid.at[:, own].set(view.history_valid.T, mode="drop"),
-        size,
+    """All objects, the controlled ones where they were simulated."""
+    rows = jnp.arange(bank.log.shape[2], dtype=jnp.int32)
+    logged = logged_world(bank, view, rows)
+    own, history = view.controlled, view.history
+    simulated = _motion(history[..., :2], history[..., 2], history[..., 3:])
+    return logged._replace(
+        motion=logged.motion.at[own].set(simulated, mode="drop"),
+        valid=logged.valid.at[own].set(view.history_valid, mode="drop"),
     )
+
+
+def _motion(
+    position: Float[Array, "objects history 2"],
+    yaw: Float[Array, "objects history"],
+    velocity: Float[Array, "objects history 2"],
+) -> Float[Array, "objects history 6"]:
+    heading = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], -1)
+    return jnp.concatenate([position, heading, velocity], -1)
 
 
 def exists(bank: Bank, controlled: Int[Array, "..."]) -> Bool[Array, "..."]:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sim.bank import BankFile
-from sim.observation import POSITION_SCALE, SIZE_SCALE, Observation
+from sim.features import POSITION_SCALE, SIZE_SCALE
+from sim.observation import Observation
 from sim.scene import (
     LightState,
     ObjectType,

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from sim.bank import BankFile
+from sim.features import POSITION_SCALE, SIZE_SCALE
 from sim.observation import (
-    POSITION_SCALE,
-    SIZE_SCALE,
     ObservationConfig,
     observation_sizes,
     observe_batch,

@@ -114,8 +114,7 @@ def test_a_controlled_object_alone_sees_the_log(pair: BankFile) -> None:
 
 def test_the_world_has_no_history_before_the_recording(pair: BankFile) -> None:
     world = _world(pair.bank, view_of(pair, 0, 1, 0, 1, length=3))
-    assert world.valid[0].tolist() == [False, False, False]
-    assert world.valid[1:].all()
+    assert world.valid.tolist() == [[False, True, True]] * 3
 
 
 def test_all_metrics_of_all_objects_are_the_oracles(made: BankFile) -> None:
