@@ -112,9 +112,9 @@ class ExperimentConfig:
         """Refuses a run without actors, and one whose two sides wait for each other."""
         if self.actors < 1:
             raise ValueError(f"actors={self.actors} must be at least 1")
+        insert_rows, sample_rows = largest_batches(self)
         self.replay.limiter().check_batches(
-            insert_rows=self.actor.environments * self.actor.scan_steps,
-            sample_rows=self.learner.batch_size * self.learner.batches_per_reply,
+            insert_rows=insert_rows, sample_rows=sample_rows
         )
 
 
@@ -230,3 +230,9 @@ def with_durable_replay(config: ExperimentConfig) -> ExperimentConfig:
     """The same run with its replay kept in files."""
     replay = dataclasses.replace(config.replay, durable=True)
     return dataclasses.replace(config, replay=replay)
+
+
+def largest_batches(config: ExperimentConfig) -> tuple[int, int]:
+    """Rows of the largest batch that an actor inserts, and that the learner samples."""
+    inserted = config.actor.environments * config.actor.scan_steps
+    return inserted, config.learner.batch_size * config.learner.batches_per_reply

@@ -20,7 +20,7 @@ from actors.actor import Tick, exploration, run_actor
 from actors.frames import FrameBatch, encode_frames
 from actors.network import layout_hash, parameter_layout
 from actors.rows import row_spec
-from launch.config import CONFIG, ExperimentConfig, read_run
+from launch.config import CONFIG, ExperimentConfig, largest_batches, read_run
 from launch.errors import LaunchError
 from launch.join import (
     HELD_OUT,
@@ -87,6 +87,7 @@ def replay_role(
             config=replay,
             seed=run.config.seed,
             folder=join.run / REPLAY / str(keys.shard),
+            largest=largest_batches(run.config),
         ).run(stop)
         offered.close()
         control.close()

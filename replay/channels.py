@@ -5,6 +5,7 @@ viewer. The call to stop is small, comes once and goes first (BLOCK, high priori
 the supervisor backs it with a signal.
 """
 
+import re
 import threading
 import time
 from collections import deque
@@ -24,6 +25,10 @@ from replay.control import (
 from replay.keys import RunKeys, plain_chunk
 from replay.session import undeclare
 from replay.wire import WireError
+
+_MAX_ROLES = 16_384
+_MAX_STATUS_BYTES = 1 << 16
+_MAX_FRAME_BYTES = 16 << 20
 
 
 @final
@@ -69,8 +74,10 @@ class StatusSubscriber:
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         message = _read(sample, StatusMessage)
+        said_by = str(sample.key_expr).rsplit("/", 1)[1]
         with self._lock:
-            if message is None:
+            known = len(self._latest) < _MAX_ROLES or said_by in self._latest
+            if message is None or message.role != said_by or not known:
                 self.refused += 1
             else:
                 self._latest[message.role] = (time.monotonic(), message.values)
@@ -137,7 +144,9 @@ class FrameSubscriber:
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         actor = str(sample.key_expr).rsplit("/", 1)[1]
-        if not actor.isdecimal():
+        if not re.fullmatch(r"[0-9]{1,10}", actor):
+            return
+        if len(sample.payload) > _MAX_FRAME_BYTES:
             return
         with self._changed:
             self.dropped += len(self._frames) == self._frames.maxlen
@@ -178,6 +187,8 @@ def send_stop(session: zenoh.Session, keys: RunKeys, reason: str) -> None:
 
 def _read(sample: zenoh.Sample, kind: type[MessageT]) -> MessageT | None:
     """The message, or None: what may be lost may also be unreadable."""
+    if len(sample.payload) > _MAX_STATUS_BYTES:
+        return None
     try:
         return decode(sample.payload.to_bytes(), kind)
     except WireError:

@@ -206,6 +206,11 @@ class Sampler:
         if reply.status is Status.REFUSED:
             raise ReplayError(f"replay refused to sample: {reply.reason}")
         if reply.sample is not None:
+            if len(reply.sample.ids) != self._batch_size * self._batches:
+                raise WireError(
+                    f"replay answered with {len(reply.sample.ids)} rows to "
+                    f"{self._batches} batches of {self._batch_size}"
+                )
             self._ready.extend(_batches_of(reply.sample, self._batch_size))
 
 
@@ -268,7 +273,10 @@ def fetch_rows(
         reply = SampleReply.decode(payload, spec)
         if reply.sample is None:
             raise WireError(f"replay refused to hand out rows: {reply.reason}")
-        if len(reply.sample.ids) == 0:
+        ids = reply.sample.ids
+        if len(ids) == 0:
             return
+        if int(ids[0]) < first_id or (ids[1:] <= ids[:-1]).any():
+            raise WireError(f"replay handed out ids out of order, from {ids[0]} on")
         yield reply.sample
         first_id = int(reply.sample.ids[-1]) + 1

@@ -62,7 +62,7 @@ class FileServer:
                 return
             path, size, digest = self._files[name]
             with path.open("rb") as stream:
-                stream.seek(request.offset)
+                stream.seek(min(request.offset, size))
                 data = stream.read(min(request.length, _CHUNK_BYTES))
             reply = FileReply(size=size, sha256=digest, data=data)
             query.reply(query.key_expr, encode(reply))

@@ -13,12 +13,35 @@ from typing import final
 import zenoh
 
 from replay.counters import Counters
-from replay.ledger import Ledger, Verdict
+from replay.ledger import Ledger, Verdict, WriterState
 from replay.local import LocalReplay
+from replay.records import MAX_WRITERS
 from replay.requests import HeldInsert, answer, end, payload_of
 from replay.spec import ReplayError, RowSpec
 from replay.storage import WriterMark
 from replay.wire import Insert, InsertReply, Status
+
+MAX_WAITING = 64  # batches of one writer
+MAX_WAITING_BYTES = 256 << 20  # of all
+
+
+def _refusal(held: HeldInsert, verdict: Verdict) -> tuple[Status, str]:
+    """How a batch that can never be accepted is answered."""
+    writer, epoch = held.message.writer, held.message.epoch
+    if verdict is Verdict.FULL:
+        return Status.REFUSED, (
+            f"writer {writer}: the service has {MAX_WRITERS} writers, as many as it "
+            "may; number the actors from 0"
+        )
+    if verdict is Verdict.FOREIGN:
+        return Status.STALE, (
+            f"writer {writer} of epoch {epoch} is another process; give every actor "
+            "its own number"
+        )
+    return Status.STALE, (
+        f"writer {writer} of epoch {epoch} was replaced by a process of epoch "
+        f"{held.state.epoch}; give every actor its own number"
+    )
 
 
 @final
@@ -42,13 +65,16 @@ class InsertDesk:
         self._check_rows = check_rows
         self._held: deque[HeldInsert] = deque()
         self._told = ""  # the fault that was said
-        self.ledger: Ledger[HeldInsert] = Ledger()
+        self.ledger: Ledger[HeldInsert] = Ledger(MAX_WRITERS)
         for mark in replay.writers:
             self.ledger.restore(
-                writer=mark.writer,
-                epoch=mark.epoch,
-                next_sequence=mark.next_sequence,
-                rows=mark.rows,
+                WriterState(
+                    writer=mark.writer,
+                    epoch=mark.epoch,
+                    next_sequence=mark.next_sequence,
+                    life=mark.life,
+                    rows=mark.rows,
+                )
             )
 
     def take(self, query: zenoh.Query, arrived: float) -> None:
@@ -73,18 +99,28 @@ class InsertDesk:
             epoch=message.epoch,
             sequence=message.sequence,
             base=message.base,
+            life=message.life,
         )
         self._drop_superseded()
         held = HeldInsert(message=message, query=query, arrived=arrived, state=state)
-        if verdict is Verdict.NEXT:
+        if verdict is Verdict.NEXT and self._is_full(state):
+            self._counters.gaps += 1
+            self._acknowledge(held, Status.GAP)
+        elif verdict is Verdict.NEXT:
             state.waiting.append(held)
             self._held.append(held)
         elif verdict is Verdict.REPLACES:
             earlier = state.waiting[message.sequence - state.next_sequence]
             end(earlier.query)
             earlier.query, earlier.arrived = query, arrived
+            earlier.message = message
         else:
             self._answer_unstored(held, verdict)
+
+    def _is_full(self, state: WriterState[HeldInsert]) -> bool:
+        """Whether as much waits as may: the writer sends it again soon."""
+        waiting = sum(held.message.rows.nbytes for held in self._held)
+        return len(state.waiting) >= MAX_WAITING or waiting > MAX_WAITING_BYTES
 
     def _answer_unstored(self, held: HeldInsert, verdict: Verdict) -> None:
         """Duplicates, gaps and stale batches are answered at once."""
@@ -96,12 +132,8 @@ class InsertDesk:
             self._acknowledge(held, Status.GAP)
         else:
             self._counters.refused += 1
-            reason = (
-                f"writer {held.message.writer} of epoch {held.message.epoch} was "
-                f"replaced by a process of epoch {held.state.epoch}; give every actor "
-                "its own number"
-            )
-            self._acknowledge(held, Status.STALE, reason)
+            status, reason = _refusal(held, verdict)
+            self._acknowledge(held, status, reason)
 
     def _drop_superseded(self) -> None:
         """Lets go of what waited for a writer that has moved on."""
@@ -141,7 +173,7 @@ class InsertDesk:
             epoch=state.epoch,
             next_sequence=state.next_sequence + 1,
             rows=state.rows + len(rows),
-            life=0,
+            life=state.life,
         )
         self._replay.insert_bytes(rows, mark)
         self.ledger.stored(state, len(rows))

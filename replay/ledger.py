@@ -6,6 +6,7 @@ that will be stored next and the batches that wait for the rate limiter, in orde
 A batch (epoch, sequence, base) of a writer of which `waiting` batches wait is
 
     of an older epoch             STALE: a newer process writes under this number
+    of this epoch, another life   FOREIGN: a second process claims the number
     of a newer or first epoch     taken up at `base`; what waited is dropped
     based above next + waiting    the same: a former life of the service, whose rows
                                   are gone, acknowledged what is below
@@ -14,6 +15,8 @@ A batch (epoch, sequence, base) of a writer of which `waiting` batches wait is
                                   answer to the earlier copy
     next_sequence + waiting       NEXT: waits for the limiter behind the others
     above that                    GAP
+
+and of a writer that is not known, when there are as many as there may be, FULL.
 """
 
 import enum
@@ -33,6 +36,8 @@ class Verdict(enum.Enum):
     DUPLICATE = enum.auto()
     GAP = enum.auto()
     STALE = enum.auto()
+    FOREIGN = enum.auto()
+    FULL = enum.auto()
 
 
 @final
@@ -43,6 +48,7 @@ class WriterState(Generic[T]):
     writer: int
     epoch: int
     next_sequence: int
+    life: int  # of the process that writes
     rows: int = 0  # stored, of all epochs
     waiting: deque[T] = field(default_factory=deque)  # from next_sequence on
 
@@ -56,46 +62,41 @@ class WriterState(Generic[T]):
 class Ledger(Generic[T]):
     """All writers. T is what waits: a batch with its query."""
 
-    def __init__(self) -> None:
-        """Knows nobody yet."""
+    def __init__(self, most: int = 1 << 32) -> None:
+        """Knows nobody yet; takes up at most `most` writers."""
+        self._most = most
         self._writers: dict[int, WriterState[T]] = {}
         self.dropped: deque[T] = deque()
         """What waited and will not be stored; the caller lets go of the queries."""
 
-    def __len__(self) -> int:
-        """How many writers there are."""
-        return len(self._writers)
-
-    def __contains__(self, writer: object) -> bool:
-        """Whether a writer of this number has been seen."""
-        return writer in self._writers
-
-    def restore(
-        self, *, writer: int, epoch: int, next_sequence: int, rows: int
-    ) -> None:
+    def restore(self, state: WriterState[T]) -> None:
         """Takes up a writer where a former life of the service left it."""
-        self._writers[writer] = WriterState(
-            writer=writer, epoch=epoch, next_sequence=next_sequence, rows=rows
-        )
+        self._writers[state.writer] = state
 
     def __iter__(self) -> Iterator[WriterState[T]]:
         """All writers, in the order of their numbers."""
         return iter(sorted(self._writers.values(), key=lambda state: state.writer))
 
     def judge(
-        self, *, writer: int, epoch: int, sequence: int, base: int
+        self, *, writer: int, epoch: int, sequence: int, base: int, life: int = 0
     ) -> tuple[Verdict, WriterState[T]]:
         """What the batch is; takes up new writers, epochs and bases."""
         state = self._writers.get(writer)
         if state is None:
-            state = WriterState(writer=writer, epoch=epoch, next_sequence=base)
+            state = WriterState(
+                writer=writer, epoch=epoch, next_sequence=base, life=life
+            )
+            if len(self._writers) >= self._most:
+                return Verdict.FULL, state
             self._writers[writer] = state
         if epoch < state.epoch:
             return Verdict.STALE, state
+        if epoch == state.epoch and life != state.life:
+            return Verdict.FOREIGN, state
         if epoch > state.epoch or base > state.expected:
             self.dropped.extend(state.waiting)
             state.waiting.clear()
-            state.epoch, state.next_sequence = epoch, base
+            state.epoch, state.next_sequence, state.life = epoch, base, life
         if sequence < state.next_sequence:
             return Verdict.DUPLICATE, state
         if sequence < state.expected:

@@ -33,6 +33,7 @@ from replay.session import undeclare
 from replay.spec import ReplayError, RowSpec
 from replay.table import PriorityError
 from replay.wire import (
+    MAX_REPLY_BYTES,
     FetchRequest,
     SampleReplyBuffer,
     SampleRequest,
@@ -44,6 +45,8 @@ from replay.wire import (
 __all__ = ["ReplayConfig", "ReplayServer"]
 
 _LONGEST_WAIT_S = 0.1  # between looks at the stop event
+_MAX_EVENTS = 4096  # unread
+_MAX_SAMPLES = 1024  # requests that wait for the limiter, or for the disk
 
 
 @final
@@ -59,10 +62,13 @@ class ReplayServer:
         config: ReplayConfig,
         seed: int = 0,
         folder: Path | None = None,
+        largest: tuple[int, int] | None = None,
     ) -> None:
         """Makes the table, or takes up that of `folder` if the configuration says so.
 
-        Requests are taken from `run` on.
+        Requests are taken from `run` on. `largest`: rows of the run's largest batches,
+        (insert, sample); larger ones are refused. Unless it is given, those that come
+        first decide which others could deadlock with them.
         """
         self._session = session
         self._keys = keys
@@ -81,8 +87,9 @@ class ReplayServer:
             incarnation=self._incarnation,
             check_rows=lambda rows: self._check_batches(insert_rows=rows),
         )
-        self._insert_rows = 1  # the largest batches seen
-        self._sample_rows = 1
+        self._bounded = largest is not None
+        # The largest batches seen, or that may come.
+        self._insert_rows, self._sample_rows = largest or (1, 1)
         self._ready = threading.Event()
 
     def wait_ready(self, timeout: float) -> bool:
@@ -129,7 +136,11 @@ class ReplayServer:
         events = self._events
 
         def on_query(query: zenoh.Query) -> None:
-            events.put((name, query, time.monotonic()))
+            # A flood is turned away unread: an empty answer means "ask again".
+            if events.qsize() >= _MAX_EVENTS:
+                end(query)
+            else:
+                events.put((name, query, time.monotonic()))
 
         return on_query
 
@@ -142,6 +153,11 @@ class ReplayServer:
             self._replay.update_priorities(message.ids, message.priorities)
         except (WireError, LimiterError, PriorityError) as error:
             self._refuse(query, str(error))
+            return
+        if len(self._samples) >= _MAX_SAMPLES:
+            self._counters.busy_samples += 1
+            busy = encode_sample_refusal(Status.BUSY, "", self._spec)
+            answer(query, busy)
             return
         self._samples.append(HeldSample(message=message, query=query, arrived=arrived))
 
@@ -170,6 +186,14 @@ class ReplayServer:
             raise ReplayError(
                 f"a batch of {insert_rows} rows exceeds the table's capacity of "
                 f"{self._replay.config.capacity}"
+            )
+        if self._bounded and (
+            insert_rows > self._insert_rows or sample_rows > self._sample_rows
+        ):
+            raise LimiterError(
+                f"a batch of {max(insert_rows, sample_rows)} rows: this run's are at "
+                f"most {self._insert_rows} (insert) and {self._sample_rows} (sample); "
+                "start all roles with one configuration"
             )
         insert_rows = max(insert_rows, self._insert_rows)
         sample_rows = max(sample_rows, self._sample_rows)
@@ -219,8 +243,9 @@ class ReplayServer:
         except WireError as error:
             self._refuse(query, str(error))
             return
+        most = max(1, MAX_REPLY_BYTES // (16 + self._spec.row_bytes))
         ids, probabilities, rows = self._replay.table.read(
-            message.first_id, message.limit
+            message.first_id, min(message.limit, most)
         )
         buffer = SampleReplyBuffer(spec=self._spec, count=len(ids))
         buffer.ids[:] = ids
@@ -247,6 +272,8 @@ class ReplayServer:
         durable = self._replay.durable
         if durable is None:
             answer(query, encode(self.stats()))
+        elif len(self._syncs) >= _MAX_SAMPLES:
+            end(query)
         else:
             self._syncs.append((durable.ask_sync(), query, self.stats()))
 

@@ -305,7 +305,7 @@ class Table:
         UInt8[np.ndarray, "rows row_bytes"],
     ]:
         """Ids, probabilities and bytes of the first `limit` rows from `first_id`."""
-        start = max(first_id, self._oldest)
+        start = min(max(first_id, self._oldest), self.inserts)
         # Without removed rows the next `limit` ids are all there.
         reach = self.inserts if self._removed else min(start + limit, self.inserts)
         ids = np.arange(start, max(start, reach), dtype=np.int64)

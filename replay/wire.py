@@ -11,7 +11,7 @@ Every header begins with the same 16 bytes:
 and is padded to 64 bytes, so that rows behind it stay aligned.
 
     Insert        writer u32, rows u32, epoch u64, sequence u64, base u64,
-                  hold ms u32; then rows
+                  hold ms u32, life u64; then rows
     InsertReply   status u16, writer u32, epoch u64, next sequence u64,
                   incarnation u64; then the reason as UTF-8
     SampleRequest batch size u32, batches u32, updates u32, hold ms u32; then
@@ -33,11 +33,14 @@ from jaxtyping import Float, UInt8, UInt64
 
 from replay.spec import ReplayError, RowSpec, Sample
 
-WIRE_VERSION = 1
+WIRE_VERSION = 2
 MAGIC = b"SLST"
 HEADER_BYTES = 64
 MAX_ROWS = 1 << 20  # per message
 MAX_UPDATES = 1 << 20
+MAX_REPLY_BYTES = 256 << 20
+MAX_NUMBER = 1 << 62  # of epochs and sequences: the next one must fit as well
+MAX_HOLD_MS = 60_000  # longer ones are cut: nobody may keep the service's memory
 _COMMON = struct.Struct("<4sHH8s")
 _NO_SCHEMA = bytes(8)
 
@@ -67,7 +70,7 @@ class Status(enum.IntEnum):
     REFUSED = 4  # it can never be accepted; the reason says why
 
 
-_INSERT = struct.Struct("<IIQQQI")
+_INSERT = struct.Struct("<IIQQQIQ")
 _INSERT_REPLY = struct.Struct("<HxxIQQQ")
 _SAMPLE_REQUEST = struct.Struct("<IIII")
 _SAMPLE_REPLY = struct.Struct("<HxxIQQ")
@@ -143,6 +146,7 @@ class Insert:
     base: int  # the lowest sequence that the writer knows no acknowledgement of
     hold_ms: int  # the service may hold its answer so long
     rows: UInt8[np.ndarray, "rows row_bytes"]
+    life: int = 0  # random; tells two processes of one number and epoch apart
 
     def encode(self, spec: RowSpec) -> bytes:
         """Header, then the rows' bytes."""
@@ -153,6 +157,7 @@ class Insert:
             self.sequence,
             self.base,
             self.hold_ms,
+            self.life,
         )
         return _header(Kind.INSERT, spec.schema_hash, head) + self.rows.tobytes()
 
@@ -160,11 +165,12 @@ class Insert:
     def decode(payload: bytes, spec: RowSpec) -> "Insert":
         """Parses and checks; the rows are a view of the payload."""
         _open(payload, Kind.INSERT, spec.schema_hash)
-        writer, count, epoch, sequence, base, hold_ms = _INSERT.unpack_from(
+        writer, count, epoch, sequence, base, hold_ms, life = _INSERT.unpack_from(
             payload, _COMMON.size
         )
         _check_count(Kind.INSERT, "rows", count, MAX_ROWS)
         _check_length(payload, Kind.INSERT, count * spec.row_bytes)
+        _check_count(Kind.INSERT, "as its number", max(epoch, sequence), MAX_NUMBER)
         if count == 0 or base > sequence:
             raise WireError(
                 f"INSERT: {count} rows as sequence {sequence} after {base}; a batch "
@@ -176,8 +182,9 @@ class Insert:
             epoch=epoch,
             sequence=sequence,
             base=base,
-            hold_ms=hold_ms,
+            hold_ms=min(hold_ms, MAX_HOLD_MS),
             rows=rows.reshape(count, spec.row_bytes),
+            life=life,
         )
 
 
@@ -252,10 +259,12 @@ class SampleRequest:
         _check_length(payload, kind, 16 * updates)
         if batch_size * batches == 0:
             raise WireError(f"{kind.name}: {batches} batches of {batch_size} rows")
+        size = batch_size * batches * (16 + spec.row_bytes)
+        _check_count(kind, "bytes asked for", size, MAX_REPLY_BYTES)
         return SampleRequest(
             batch_size=batch_size,
             batches=batches,
-            hold_ms=hold_ms,
+            hold_ms=min(hold_ms, MAX_HOLD_MS),
             ids=np.frombuffer(payload, "<u8", updates, HEADER_BYTES),
             priorities=np.frombuffer(
                 payload, "<f8", updates, HEADER_BYTES + 8 * updates
@@ -266,7 +275,7 @@ class SampleRequest:
 @final
 @dataclass(frozen=True, kw_only=True)
 class FetchRequest:
-    """Anyone to service: up to `limit` rows with ids from `first_id`, in order."""
+    """Anyone to service: some of the rows from `first_id`, in order, if there are."""
 
     first_id: int
     limit: int
@@ -347,6 +356,8 @@ class SampleReply:
             size=size,
             inserts=inserts,
         )
+        if not (abs(sample.probabilities - 0.5) <= 0.5 + 1e-9).all():  # NaN is not
+            raise WireError(f"{kind.name}: probabilities outside of [0, 1]")
         return SampleReply(status=status, reason="", sample=sample)
 
 

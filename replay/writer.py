@@ -19,6 +19,7 @@ What the writer does with an answer:
     STALE, REFUSED   raise in the caller's thread
 """
 
+import secrets
 import threading
 import time
 from collections import deque
@@ -71,6 +72,7 @@ class Writer:
         self._spec = spec
         self._writer = writer
         self._epoch = epoch
+        self._life = secrets.randbits(64)
         self._limit = window
         self._hold_s = hold_s
         self._partial = np.zeros(batch_rows, spec.dtype)
@@ -220,6 +222,7 @@ class Writer:
             base=base,
             hold_ms=int(self._hold_s * 1e3),
             rows=batch.rows,
+            life=self._life,
         )
         self._session.get(
             self._key,
@@ -241,6 +244,12 @@ class Writer:
                 return
             if reply.status in (Status.STALE, Status.REFUSED):
                 self._error = ReplayError(f"replay refused the rows: {reply.reason}")
+            elif reply.next_sequence > self._next_sequence:
+                self._error = ReplayError(
+                    f"replay acknowledges batch {reply.next_sequence - 1} of writer "
+                    f"{self._writer}, which was never sent; does another process use "
+                    "this number?"
+                )
             elif (reply.writer, reply.epoch) == (self._writer, self._epoch):
                 self._failures = 0
                 self._forget_below(reply.next_sequence)

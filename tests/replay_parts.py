@@ -90,12 +90,19 @@ def service(
     seed: int = 0,
     spec: RowSpec = SPEC,
     folder: Path | None = None,
+    largest: tuple[int, int] | None = None,
 ) -> Iterator[Service]:
     """A replay service in a thread of this process, over a real TCP link."""
     endpoint = free_endpoint()
     router = open_session(listen=[endpoint], router=True)
     server = ReplayServer(
-        session=router, keys=KEYS, spec=spec, config=config, seed=seed, folder=folder
+        session=router,
+        keys=KEYS,
+        spec=spec,
+        config=config,
+        seed=seed,
+        folder=folder,
+        largest=largest,
     )
     stop = threading.Event()
     thread = threading.Thread(target=server.run, args=(stop,))

@@ -132,14 +132,14 @@ def test_fifty_kills_with_four_writers(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_million_rows_are_back_in_seconds(tmp_path: Path) -> None:
     replay = LocalReplay(spec=CHECKED, config=LOADED, seed=0, folder=tmp_path)
-    rows = CHECKED.as_bytes(checked_rows(0, 1000, writer=0))
-    for _ in range(1 << 10):
-        while not replay.may_insert(1000):
-            if not replay.may_sample(4096):
+    rows = CHECKED.as_bytes(checked_rows(0, 500, writer=0))
+    for _ in range(1 << 11):
+        while not replay.may_insert(500):
+            if not replay.may_sample(500):
                 assert replay.durable is not None
                 replay.durable.wait()
             else:
-                replay.sample(4096)
+                replay.sample(500)
         replay.insert_bytes(rows)
     before = replay.inserts
     assert before == 1_024_000
