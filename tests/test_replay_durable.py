@@ -152,7 +152,7 @@ class World:
 PHASES = (Phase.explicit, Phase.reuse, Phase.generate)
 
 
-@settings(deadline=None, max_examples=50, phases=PHASES)
+@settings(deadline=None, max_examples=30, phases=PHASES)
 @given(seed=st.integers(0, 2**32), budgets=st.lists(st.integers(0, 4000), max_size=6))
 def test_stopped_at_any_store_every_acknowledged_batch_is_there_once(
     seed: int, budgets: list[int]

@@ -96,7 +96,7 @@ def test_limited_draws_are_those_taken_one_after_the_other(sampler: Name) -> Non
         (i, j): shares[i] * shares[j] / (1 - shares[i])
         for i, j in itertools.permutations(range(4), 2)
     }
-    table, times = make_table(sampler, most=1, capacity=64), 1000
+    table, times = make_table(sampler, most=1, capacity=64), 500
     seen: Counter[tuple[int, ...]] = Counter()
     for _ in range(times):
         first = table.inserts
