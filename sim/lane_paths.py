@@ -8,9 +8,12 @@ graph they are one *run*; a lane change, or a stretch off all lanes, begins anot
   graph reaches from the last of them. A stretch off the lanes (a car park, a driveway)
   is on-route as it was driven, since no lane path could contain it.
 - Off-route is everything else that the graph reaches from a run's first lane.
-- Arc length counts from the start of the first run's first lane. It goes on from run
-  to run by the distance driven between them, so that it grows along the log; beyond a
-  fork that joins again it is that of the shorter way.
+- Where the log starts it may be as well on other lanes (not farther by more than `TIE`:
+  behind a fork, between two lanes). What these reach is off-route; if they are as near
+  all along, as where the log stands, it is on-route.
+- Arc length is 0 where the log starts, negative behind it. It goes on from run to run
+  by the distance driven between them, so that it grows along the log; beyond a fork
+  that joins again it is that of the shorter way.
 
 Paths end `AHEAD` behind the log's end or `RANGE` behind its start, whichever is
 farther, and before a lane that they hold already, so that rings end; of more than
@@ -43,6 +46,7 @@ from sim.lanes import (
     arc_lengths,
     match,
     nearest,
+    on_lane,
     segments_of,
     without_repeats,
 )
@@ -55,6 +59,7 @@ RANGE = 150.0  # m
 CHUNK = 8  # segments a chunk
 MAX_CHUNKS = 96  # of an object
 STRIDE = 0.25  # m between the poses that are matched
+TIE = 1.0  # m
 LOOK = 8.0  # m around the log in which lanes are compared with it
 MAX_ON = 5.0  # m: a log is off-route where it is farther from its paths
 MAX_BEHIND = 2.0  # m: or by this nearer to another path
@@ -99,7 +104,9 @@ def object_pieces(
         if not any(run.lanes for run in runs):
             return [], lanes
         chains, driven, end = _chains(graph, near, xy, runs)
-        pieces = driven + pieces_of(graph, chains, max(end + AHEAD, RANGE))
+        limit = max(end + AHEAD, RANGE)
+        pieces = driven + pieces_of(graph, chains, limit)
+        pieces = _merged(pieces, _beside(graph, near, lanes, limit))
         wrong = np.flatnonzero(_off_route(near, pieces, xy))
         if not len(wrong):
             break
@@ -215,6 +222,35 @@ def pieces_of(graph: LaneGraph, chains: list[Chain], limit: float) -> list[Piece
         Piece(lane, way, OFF) for lane, way in off.items() if lane not in on_lanes
     ]
     return pieces
+
+
+def _beside(
+    graph: LaneGraph, near: Near, lanes: Int[np.ndarray, " poses"], limit: float
+) -> dict[int, Piece]:
+    """The paths from the lanes that the first pose is as well on as on its own."""
+    pieces: dict[int, Piece] = {}
+    if lanes[0] == NOWHERE:
+        return pieces
+    own = np.where(near.lines == lanes[:, None], near.distance, np.inf).min(1)
+    tied = on_lane(graph, near) & (near.distance <= own[:, None] + TIE)
+    for column in np.flatnonzero(tied[0] & (near.lines != lanes[0])):
+        lane, way = int(near.lines[column]), -float(near.arc[0, column])
+        flag = ON if tied[:, column].all() else OFF
+        for other, start in graph.reach([(lane, way)], limit).items():
+            known = pieces.get(other, Piece(other, start, flag))
+            pieces[other] = known._replace(flags=known.flags | flag)
+    return pieces
+
+
+def _merged(pieces: list[Piece], more: dict[int, Piece]) -> list[Piece]:
+    """Both, a lane of both once: as in the first, with the flags of both."""
+    merged = []
+    for piece in pieces:
+        lane = piece.line if isinstance(piece.line, int) else NOWHERE
+        flags = more[lane].flags if lane in more else 0
+        merged.append(piece._replace(flags=piece.flags | flags))
+    known = {piece.line for piece in pieces if isinstance(piece.line, int)}
+    return merged + [piece for lane, piece in more.items() if lane not in known]
 
 
 def _off_route(

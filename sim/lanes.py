@@ -38,6 +38,7 @@ NEXT_COST = 0.1  # of going on along the graph: staying is the default
 HOP_COST = 12.0  # of any other change: worth 3.5 m for two poses
 OFF_COST = 12.0  # of a pose on no lane: above any that is on one
 SKIP = 5.0  # m of short lanes that a drive may pass between two poses, beyond its move
+BLOCK = 16  # poses whose surroundings are looked at together
 NOWHERE = -1  # the lane of a pose that is on none
 
 
@@ -151,7 +152,9 @@ def lane_graph(roads: Sequence[Polyline], origin: Float[np.ndarray, "2"]) -> Lan
 
 def without_repeats(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "_ 2"]:
     """The polyline less the points that repeat the one before."""
-    return points[np.r_[True, np.abs(np.diff(points, axis=0)).max(1) > 1e-6]]
+    kept = np.ones(len(points), bool)
+    kept[1:] = np.abs(np.diff(points, axis=0)).max(1, initial=0.0) > 1e-6
+    return points[kept]
 
 
 def arc_lengths(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, " points"]:
@@ -186,11 +189,12 @@ def _joined(lines: Sequence[np.ndarray]) -> tuple[tuple[int, ...], ...]:
     """Successors by where lanes begin and end."""
     starts = np.array([line[0] for line in lines]).reshape(-1, 2)
     order = np.argsort(starts[:, 0])
+    sorted_x = starts[order, 0]
     exits = []
     for index, line in enumerate(lines):
         # By x first: all pairs would be too many where lanes are cut small.
         bounds = line[-1, 0] + np.array([-JOIN_DISTANCE, JOIN_DISTANCE])
-        near = order[slice(*np.searchsorted(starts[order, 0], bounds))]
+        near = order[slice(*np.searchsorted(sorted_x, bounds))]
         near = near[np.hypot(*(starts[near] - line[-1]).T) < JOIN_DISTANCE]
         yaw = _angle(line[-1] - line[-2])
         exits.append(
@@ -234,11 +238,17 @@ def nearest(
     yaw: Float[np.ndarray, " poses"],
     reach: float,
 ) -> Near:
-    """How poses stand to every line that may be within `reach` of one of them."""
-    low, high = xy.min(0) - reach, xy.max(0) + reach
+    """How poses stand to every line that is within `reach` of one of them.
+
+    Farther segments of these lines may be left out.
+    """
     ends = segments.start + segments.along
-    kept = (np.minimum(segments.start, ends) <= high).all(1)
-    kept &= (np.maximum(segments.start, ends) >= low).all(1)
+    low, high = np.minimum(segments.start, ends), np.maximum(segments.start, ends)
+    kept = np.zeros(len(low), bool)
+    for pose in range(0, len(xy), BLOCK):
+        block = xy[pose : pose + BLOCK]
+        inside = (low <= block.max(0) + reach).all(1)
+        kept |= inside & (high >= block.min(0) - reach).all(1)
     start, along, arc, line = (value[kept] for value in segments)
     squared = np.maximum((along**2).sum(1), 1e-18)
     offset_x = xy[:, :1] - start[:, 0]
@@ -247,13 +257,15 @@ def nearest(
     t = np.clip(part, 0.0, 1.0)
     apart = np.hypot(offset_x - t * along[:, 0], offset_y - t * along[:, 1])
     lines, first = np.unique(line, return_index=True)
-    bounds = [*first.tolist(), len(line)]
+    close = np.minimum.reduceat(apart.min(0), first) <= reach
+    bounds = np.stack([first, np.append(first, len(line))[1:]], -1)[close]
+    lines = lines[close]
     shape = (len(xy), len(lines))
     distance, where, turn, beyond = (np.empty(shape) for _ in range(4))
     every = np.arange(len(xy))
     for column in range(len(lines)):
-        own = slice(bounds[column], bounds[column + 1])
-        best = apart[:, own].argmin(1) + bounds[column]
+        begin, end = bounds[column]
+        best = apart[:, begin:end].argmin(1) + begin
         length = np.sqrt(squared[best])
         distance[:, column] = apart[every, best]
         where[:, column] = arc[best] + t[every, best] * length

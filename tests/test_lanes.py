@@ -194,6 +194,24 @@ def test_the_log_is_never_off_its_own_route() -> None:
     assert on[-1] == 1
 
 
+def test_where_a_log_stands_on_two_lanes_both_go_on() -> None:
+    """Just behind a fork; a log that drives on decides which is its route."""
+    graph = lane_graph(FORK, ORIGIN)
+    standing = np.array([[36.0, 0.1]])
+    pieces, on = lane_paths.object_pieces(graph, standing, np.zeros(1))
+    assert on.tolist() == [1]
+    assert flags(pieces) == {1: ON, 2: ON}
+    pieces, _ = lane_paths.object_pieces(graph, *drive((36, 0.1), (60, 0)))
+    assert flags(pieces) == {1: ON, 2: OFF}
+
+
+def test_between_two_lanes_either_may_be_taken() -> None:
+    graph = lane_graph((lane((0, 0), (90, 0)), lane((0, 3.5), (90, 3.5))), ORIGIN)
+    for y, expected in ((1.0, {0: ON}), (1.3, {0: ON, 1: ON})):
+        pieces, _ = lane_paths.object_pieces(graph, np.array([[9.0, y]]), np.zeros(1))
+        assert flags(pieces) == expected
+
+
 def test_a_ring_ends() -> None:
     """A roundabout of four lanes with an entry and an exit, gone round 1.35 times."""
     angle = np.linspace(0, 2 * np.pi, 41)
