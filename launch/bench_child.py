@@ -10,6 +10,7 @@ nothing else may write to; words for a person go to standard error.
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -23,8 +24,9 @@ ONE_THREAD: Final = {
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
-    "JAX_PLATFORMS": "cpu",
 }
+PATIENCE_S: Final = 10.0  # for a child that was interrupted
+CPU_ONLY: Final = frozenset({"steps", "scale", "bank"})  # whatever else JAX finds
 
 
 def run(
@@ -37,6 +39,8 @@ def run(
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     if one_core:
         environment |= ONE_THREAD
+    if section in CPU_ONLY:
+        environment["JAX_PLATFORMS"] = "cpu"
     text = json.dumps({**request, "section": section, "one_core": one_core})
     command = [sys.executable, "-m", "launch.bench_child", text]
     with subprocess.Popen(
@@ -48,11 +52,22 @@ def run(
                 yield json.loads(line)
             code = child.wait()
         finally:
-            child.kill()
+            _end(child)
     if code == INTERRUPTED:
         raise KeyboardInterrupt
     if code:
         raise RuntimeError(f"bench sim: section {section} ended with code {code}")
+
+
+def _end(child: "subprocess.Popen[str]") -> None:
+    """Interrupts a child that still runs: it removes its files, or is killed."""
+    if child.poll() is not None:
+        return
+    child.send_signal(signal.SIGINT)
+    try:
+        child.wait(PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
 
 
 def main() -> int:
@@ -62,9 +77,11 @@ def main() -> int:
     os.dup2(2, 1)  # whatever prints must not end up among the results
     if request["one_core"]:
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    from launch.bench_sections import SECTIONS
-
+    # An end that leaves no files behind, however it is asked for.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        from launch.bench_sections import SECTIONS
+
         with tempfile.TemporaryDirectory(prefix="slipstream-bench-") as folder:
             for result in SECTIONS[request["section"]](request, Path(folder)):
                 print(json.dumps(result), file=results, flush=True)

@@ -55,7 +55,7 @@ class SimConfig:
     """Objects of it; where the scene has fewer, copies of its own fill up."""
     bank_scenes: tuple[int, ...] = (1, 1000)
     """Procedural scenes of the banks; generating 10,000 takes many minutes."""
-    seconds: float = 0.5
+    seconds: float = 0.3
     """How long each program is timed."""
     json: str = ""
     """Writes everything to this file, or to standard output by -."""

@@ -45,7 +45,6 @@ class Running:
     begin: Any  # starts, one per scene
     temporary_bytes: int
     observation_bytes: int
-    recorded: Callable[[], float]  # share of the slots that count, over an episode
 
 
 def running(
@@ -80,7 +79,6 @@ def running(
         begin=begin,
         temporary_bytes=int(memory.temp_size_in_bytes) if memory else 0,
         observation_bytes=bytes_of(seen) // max(state.controlled.size, 1),
-        recorded=lambda: float(np.mean([step()[1].valid.mean() for _ in range(80)])),
     )
 
 
@@ -93,6 +91,24 @@ def state_bytes(bank: Bank, choose: episodes.Choice, config: EnvironmentConfig) 
     """What an environment holds from step to step, bank excluded."""
     begin = jax.eval_shape(lambda bank: episodes.starts(bank, choose, config), bank)
     return bytes_of(begin) // bank.sdc.shape[0]
+
+
+def chosen(slots: int, controlled: int) -> episodes.Choice:
+    """All objects, or the SDC and those nearest to it."""
+    return every_object if controlled >= slots else episodes.NearestToSdc(controlled)
+
+
+def recorded_share(file: BankFile, controlled: int) -> float:
+    """Share of the controlled slots whose object was recorded, over an episode."""
+    valid = file.arrays["log_valid"]
+    choose = chosen(valid.shape[2], controlled)
+    begin = episodes.starts(file.bank, choose, configuration(file.dt))
+    shares = []
+    for scene, rows in enumerate(np.asarray(begin.controlled)):
+        first, last = (int(file.arrays[n][scene]) for n in ("current_step", "steps"))
+        held = valid[scene, first + 1 : last][:, rows[rows < valid.shape[2]]]
+        shares.append(held.sum() / (held.shape[0] * len(rows)))
+    return float(np.mean(shares))
 
 
 def measured(
@@ -114,7 +130,6 @@ def measured(
         "agent_steps_per_s": agents / found.median_ms * 1e3,
         "best_agent_steps_per_s": agents / found.least_ms * 1e3,
         "us_per_agent_step": found.median_ms * 1e3 / agents,
-        "recorded_share": batch.recorded(),
         "state_bytes_per_environment": state_bytes(bank, choose, config),
         "temporary_bytes_per_environment": batch.temporary_bytes // environments,
         "observation_bytes_per_agent": batch.observation_bytes,
@@ -134,7 +149,8 @@ def steps(work: Work) -> Iterator[dict[str, Any]]:
         )
         file = sized(work.scene, slots, work.folder).file
         row = measured(file, controlled, environments, 2 * work.seconds)
-        yield {"whole": slots == whole, **row}
+        share = recorded_share(file, controlled)
+        yield {"whole": slots == whole, "recorded_share": share, **row}
 
 
 def scale(work: Work) -> Iterator[dict[str, Any]]:

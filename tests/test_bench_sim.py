@@ -336,7 +336,7 @@ def test_whole_steps_go_on_past_the_end_of_episodes(work: Work) -> None:
     assert int(file.arrays["current_step"][0]) in steps  # it began again
     held = bench_steps.state_bytes(file.bank, episodes.NearestToSdc(2), config)
     assert bench_steps.bytes_of(state) == 3 * held
-    assert 0 < batch.recorded() <= 1
+    assert bench_steps.recorded_share(file, 2) == 1.0
 
 
 def test_figures_show_ours_and_the_papers(table6_row: dict) -> None:
