@@ -25,6 +25,10 @@ class LearnerConfig:
     discount: float = 0.99
     """Gamma; multiplies each row's discount, which is 0 at a terminal state."""
 
+    n_step: int = 1
+    """Steps whose rewards are summed before the target network's value; rows have to
+    span as many. The paper's is 1."""
+
     target_period: int = 100
     """Updates between two copies of the network to the target network."""
 
@@ -70,6 +74,7 @@ class LearnerConfig:
             "learning_rate",
             "adam_epsilon",
             "batch_size",
+            "n_step",
             "target_period",
             "huber_threshold",
             "reward_clip",

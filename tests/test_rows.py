@@ -168,3 +168,19 @@ def test_rendering_compiles_once_for_a_batch_size(acted: Acted) -> None:
     before = len(_traces)
     rendered(file, written[64:128])
     assert len(_traces) == before
+
+
+def test_a_row_of_n_steps_shows_both_its_ends() -> None:
+    spec = rows.row_spec(3, n_step=2)
+    assert spec.dtype["states"].shape == (5, 5)
+    assert spec.dtype["reward"].shape == spec.dtype["discount"].shape == (2,)
+    assert rows.row_spec(3, n_step=1).schema_hash == rows.row_spec(3).schema_hash
+    some = np.zeros(4, spec.dtype)
+    some["step"], some["valid"] = 12, [0, 1, 1, 1, 1]
+    some["states"] = np.arange(5)[:, None]
+    before, after = rows.views_of(rows.columns_of(some), 3)
+    assert (before.step == 10).all()
+    assert (after.step == 12).all()
+    np.testing.assert_array_equal(before.history[0, 0, :, 0], [0, 1, 2])
+    np.testing.assert_array_equal(after.history[0, 0, :, 0], [2, 3, 4])
+    np.testing.assert_array_equal(before.history_valid[0, 0], [False, True, True])
