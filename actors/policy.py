@@ -27,6 +27,7 @@ from sim.observation import ObservationSizes, observation_sizes
 
 POLICY = "policy.npz"
 LATEST = "latest"
+BEST = "best"  # of a run that keeps its best checkpoint aside
 
 
 class PolicyError(Exception):
@@ -58,7 +59,7 @@ class Policy:
 
 def find_policy(path: Path) -> Path:
     """The `policy.npz` that a user means by a run, its checkpoints, or one of them."""
-    for folder in (path, path / "checkpoints"):
+    for folder in (path, path / BEST, path / "checkpoints"):
         pointer = folder / LATEST
         if pointer.is_file():
             path = folder / pointer.read_text().strip()

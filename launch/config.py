@@ -23,11 +23,16 @@ from typing import Any, Final
 import msgspec
 
 from actors.actor import ActorConfig
-from actors.network import NetworkConfig, paper_network, quick_network
+from actors.network import (
+    NetworkConfig,
+    laptop_network,
+    paper_network,
+    quick_network,
+)
 from launch.errors import LaunchError
-from learner.config import LearnerConfig
+from learner.config import CloningConfig, LearnerConfig
 from replay.local import ReplayConfig
-from sim.dynamics import ActionConfig
+from sim.dynamics import ActionConfig, ActionSpace
 from sim.environment import EnvironmentConfig
 from sim.observation import ObservationConfig
 
@@ -96,7 +101,9 @@ class ExperimentConfig:
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     """The replay service."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
-    """The updates."""
+    """Double DQN's updates."""
+    cloning: CloningConfig = field(default_factory=CloningConfig)
+    """Behaviour cloning's updates."""
     budget: BudgetConfig = field(default_factory=BudgetConfig)
     """When the run is over."""
     scenes: ScenesConfig = field(default_factory=ScenesConfig)
@@ -149,6 +156,46 @@ def paper() -> ExperimentConfig:
 
 
 PRESETS: Final = {"quick": quick, "paper": paper}
+
+
+def quick_cloning() -> ExperimentConfig:
+    """Cloning in minutes on two cores: the preset quick's scenes, view and network."""
+    return dataclasses.replace(
+        quick(),
+        cloning=CloningConfig(
+            learning_rate=1e-3,
+            batch_size=128,
+            max_gradient_norm=5.0,
+            average_updates=1000,
+        ),
+    )
+
+
+def laptop_cloning() -> ExperimentConfig:
+    """Cloning within 45 minutes on two cores, on 2,000 scenes."""
+    return dataclasses.replace(
+        quick_cloning(),
+        network=laptop_network(),
+        cloning=CloningConfig(
+            learning_rate=5e-4, max_gradient_norm=5.0, average_updates=2000
+        ),
+        budget=BudgetConfig(updates=1_000_000, minutes=35.0),
+        scenes=ScenesConfig(train=2000, held_out=200),
+    )
+
+
+def paper_cloning() -> ExperimentConfig:
+    """The paper's cloning; it does not say for how long."""
+    return dataclasses.replace(
+        paper(), budget=BudgetConfig(updates=1_000_000), cloning=CloningConfig()
+    )
+
+
+CLONING_PRESETS: Final = {
+    "quick": quick_cloning,
+    "laptop": laptop_cloning,
+    "paper": paper_cloning,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,6 +264,20 @@ def _unknown(content: Any, known: Any, at: str) -> list[str]:  # noqa: ANN401 - 
     for name in content.keys() & known.keys():
         found += _unknown(content[name], known[name], f"{at}{name}.")
     return found
+
+
+def with_space(config: ExperimentConfig, space: str) -> ExperimentConfig:
+    """The same run in one of the paper's action spaces: bicycle, delta-discrete, ..."""
+    name = space.removesuffix("-discrete")
+    action = dataclasses.replace(
+        config.environment.action, space=ActionSpace(f"{name}-discrete")
+    )
+    mixture = 0 if name != space else config.cloning.mixture or CloningConfig().mixture
+    return dataclasses.replace(
+        config,
+        environment=dataclasses.replace(config.environment, action=action),
+        cloning=dataclasses.replace(config.cloning, mixture=mixture),
+    )
 
 
 def with_environments(config: ExperimentConfig, count: int) -> ExperimentConfig:

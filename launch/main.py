@@ -68,6 +68,20 @@ def _train(words: list[str], prog: str) -> int:
     return train_command(_parse(TrainConfig, words, prog, default=default))
 
 
+def _train_bc(words: list[str], prog: str) -> int:
+    from launch.config import CLONING_PRESETS
+    from launch.train_bc import TrainBcConfig, train_bc_command
+
+    preset = _value_of(words, "--preset", "quick")
+    if preset not in CLONING_PRESETS:
+        raise LaunchError(
+            f"--preset {preset}: unknown; choose one of {', '.join(CLONING_PRESETS)}"
+        )
+    config = CLONING_PRESETS[preset]()
+    default = TrainBcConfig(preset=preset, config=config)  # type: ignore[arg-type]
+    return train_bc_command(_parse(TrainBcConfig, words, prog, default=default))
+
+
 def _value_of(words: Sequence[str], name: str, default: str) -> str:
     """An option's value, before all options can be parsed."""
     for index, word in enumerate(words):
@@ -135,6 +149,7 @@ def _role(words: list[str], prog: str) -> int:
 
 COMMANDS: Final = {
     "train dqn": Command("trains an agent, scores and records it", _train),
+    "train bc": Command("clones what the scenes' drivers did", _train_bc),
     "evaluate": Command("drives scenes with an agent and judges it", _evaluate),
     "scenes convert": Command("converts recorded scenes into a bank", _convert),
     "scenes info": Command("says what a bank or scene files hold", _info),
