@@ -63,7 +63,7 @@ def test_a_person_without_a_command_gets_the_list(
     [
         (["fly"], "no such command"),
         (["train"], "expected dqn"),
-        (["train", "ppo"], "expected dqn and not ppo"),
+        (["train", "ppo"], "expected dqn or bc and not ppo"),
         (["scenes", "eat"], "convert or info or procedural"),
         (["train", "dqn", "--preset", "slow"], "choose one of quick, paper"),
         (["train", "dqn", "--spped", "1"], "--spped"),
