@@ -338,5 +338,5 @@ def test_a_point_that_is_far_off_is_refused() -> None:
     """Tables cover all between the points: a stray one would cost all memory."""
     message = records.scenario()
     message.map_features[1].road_edge.polyline[0].y = 1e6
-    with pytest.raises(SceneError, match="span 70 x 100000[34] m, at most 50000 m"):
+    with pytest.raises(SceneError, match="at most 50000 m and"):
         _parse(message)
