@@ -1,6 +1,7 @@
 """Large but sound files of each format: 1,000 objects on a map of 10^6 points.
 
-The map is a square kilometre of parallel roads along x, 2,300 points on each polyline, that sway by 5 cm, as recorded ones do.
+The map is a square kilometre of parallel roads along x, each polyline with 2,300
+points, that sway by 5 cm, as recorded ones do.
 """
 
 import json
