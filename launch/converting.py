@@ -54,6 +54,11 @@ def processors() -> int:
     return len(os.sched_getaffinity(0))
 
 
+def _counted(count: int, noun: str) -> str:
+    """A number and what it counts."""
+    return f"{count} {noun}{'s' if count != 1 else ''}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Tally:
     """What became of the records."""
@@ -81,15 +86,22 @@ class Tally:
     def words(self) -> str:
         """What a summary adds to the number of scenes, if anything."""
         said = (
-            (self.bad, f"{self.bad} records could not be read"),
-            (self.repeated, f"{self.repeated} scenes were there twice"),
-            (self.other_dt, f"{self.other_dt} scenes of another step length"),
+            (self.bad, f"{_counted(self.bad, 'record')} could not be read"),
+            (self.repeated, f"{_counted(self.repeated, 'scene')} repeated"),
+            (
+                self.other_dt,
+                f"{_counted(self.other_dt, 'scene')} of another step length",
+            ),
             (
                 self.cut,
-                f"{self.dropped} objects of {self.cut} scenes without a slot",
+                f"{_counted(self.dropped, 'object')} of {_counted(self.cut, 'scene')} "
+                "without a slot",
             ),
-            (self.left_out, f"{self.left_out} map features could not be used"),
-            (self.resumed, f"{self.resumed} records were converted before"),
+            (
+                self.left_out,
+                f"{_counted(self.left_out, 'map feature')} could not be used",
+            ),
+            (self.resumed, f"{_counted(self.resumed, 'record')} converted before"),
         )
         return "".join(f"; {words}" for count, words in said if count)
 

@@ -99,7 +99,7 @@ def test_bad_records_are_told_and_passed_over(tmp_path: Path, capsys) -> None:
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1
     assert f"{path}: CRC mismatch in the record at byte {offsets[1]}" in captured.err
-    assert "3 scenes" in captured.out and "1 records could not be" in captured.out
+    assert "3 scenes" in captured.out and "; 1 record could not be read" in captured.out
     assert open_bank(out).scenario_ids == ("one", "three", "four")
     verify(open_bank(out))
 
@@ -136,7 +136,7 @@ def test_the_same_scene_is_taken_once(tmp_path: Path, capsys) -> None:
     assert f"{second}: record 0" in captured.err and f"{first}: record 1" in (
         captured.err
     )
-    assert "1 scenes were there twice" in captured.out
+    assert "; 1 scene repeated" in captured.out
     assert open_bank(out).scenario_ids == ("one", "two", "three")
 
 
