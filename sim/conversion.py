@@ -6,6 +6,9 @@ the options and this package's own source: what has changed in the meantime is
 converted anew, all else is found again. At most a few scenes per worker wait, so that
 memory does not grow with the number of scenes (but for a few hundred bytes each).
 
+Where a worker is killed (as for want of memory), what waited then is converted again, one
+scene at a time, which tells whose fault it was; the others go on.
+
 Workers end when the pipe that they hold the reading end of is closed, which the kernel
 does when the caller's process is killed: none outlives it, and none is waited for.
 """
@@ -36,6 +39,7 @@ from sim.slots import keep_nearest
 
 FEW = 12  # scenes: for fewer, starting processes costs more than it saves
 _WAITING = 8  # scenes per worker
+_MOST_KILLED = 3  # processes: more, and it is not the scenes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,6 +56,10 @@ class Outcome(NamedTuple):
 
     result: Part | SceneError
     found: bool  # whether an earlier conversion had got it
+    killed: bool = False  # whether the process was that converted it
+
+
+_Waiting = tuple[Found, Outcome | Future[str] | None]
 
 
 def work_folder(path: Path) -> Path:
@@ -91,14 +99,73 @@ def converted(places: Iterable[Found], conversion: Conversion) -> Iterator[Outco
         for place, outcome in itertools.chain(first, settled):
             yield outcome or _outcome(place, _convert(place, conversion), conversion)
         return
+    places_left = itertools.chain(first, settled)
+    waiting: deque[_Waiting] = deque()
+    killed = 0
+    while True:
+        try:
+            yield from _in_processes(places_left, waiting, conversion)
+            return
+        except BrokenProcessPool:
+            # Whichever of them it was that was killed: one by one they tell.
+            while waiting:
+                outcome = _alone(*waiting.popleft(), conversion)
+                killed += outcome.killed
+                if killed > _MOST_KILLED:
+                    raise SceneError(str(outcome.result)) from None
+                yield outcome
+
+
+def _in_processes(
+    places: Iterator[tuple[Found, Outcome | None]],
+    waiting: deque[_Waiting],
+    conversion: Conversion,
+) -> Iterator[Outcome]:
+    """Several at once; if a process is killed, `waiting` has what is open."""
     with _pool(conversion.workers) as pool:
-        waiting: deque[tuple[Found, Outcome | Future[str]]] = deque()
-        for place, outcome in itertools.chain(first, settled):
-            waiting.append((place, outcome or _submitted(pool, place, conversion)))
+        for place, outcome in places:
+            waiting.append((place, outcome))
+            if outcome is None:
+                waiting[-1] = (place, _submitted(pool, place, conversion))
             if len(waiting) > _WAITING * conversion.workers:
-                yield _awaited(*waiting.popleft(), conversion)
+                yield _awaited(waiting, conversion)
         while waiting:
-            yield _awaited(*waiting.popleft(), conversion)
+            yield _awaited(waiting, conversion)
+
+
+def _awaited(waiting: deque[_Waiting], conversion: Conversion) -> Outcome:
+    """The first one's outcome; it waits no longer once there is one."""
+    place, outcome = waiting[0]
+    if isinstance(outcome, Future):
+        outcome = _outcome(place, outcome.result(), conversion)
+    assert outcome is not None  # only between two lines of `_in_processes`
+    waiting.popleft()
+    return outcome
+
+
+def _alone(
+    place: Found, outcome: Outcome | Future[str] | None, conversion: Conversion
+) -> Outcome:
+    """One that waited when a process was killed, converted in a process of its own."""
+    if isinstance(outcome, Outcome):
+        return outcome
+    known = _done(place, conversion)  # it may have been got ready
+    if known is not None:
+        return known._replace(found=False)
+    assert isinstance(place, AbstractPlace)
+    try:
+        with _pool(1) as pool:
+            problem = _submitted(pool, place, conversion).result()
+    except BrokenProcessPool:
+        return Outcome(
+            SceneError(
+                f"{place.name}: the process that converted it was killed, perhaps for "
+                "want of memory; give the same command again, with fewer --workers"
+            ),
+            found=False,
+            killed=True,
+        )
+    return _outcome(place, problem, conversion)
 
 
 def _file_of(place: AbstractPlace, conversion: Conversion) -> Path:
@@ -152,22 +219,6 @@ def _outcome(place: Found, problem: str, conversion: Conversion) -> Outcome:
     path = _file_of(place, conversion)
     part = SceneError(problem) if problem else read_part(path)
     return Outcome(part or SceneError(f"{path}: is gone; start again"), False)
-
-
-def _awaited(
-    place: Found, outcome: Outcome | Future[str], conversion: Conversion
-) -> Outcome:
-    if isinstance(outcome, Outcome):
-        return outcome
-    try:
-        return _outcome(place, outcome.result(), conversion)
-    except BrokenProcessPool as error:
-        name = place.name if isinstance(place, AbstractPlace) else str(place)
-        raise SceneError(
-            f"a process was killed while converting {name} or a scene after it, "
-            "perhaps for want of memory: give the same command again, with fewer "
-            "--workers"
-        ) from error
 
 
 def _submitted(

@@ -4,12 +4,12 @@ import itertools
 import json
 import os
 import resource
-import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import final
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from sim.conversion import Conversion, Outcome, converted, work_folder, working_
 from sim.formats import list_files, read_scenes
 from sim.parts import Part
 from sim.places import AbstractPlace, places_in, procedural_places
-from sim.scene import SceneError
+from sim.scene import Scene, SceneError
 from tests import records, records_argoverse2
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -336,20 +336,29 @@ def test_ctrl_c_ends_all_and_says_how_to_go_on(tmp_path: Path, capsys) -> None:
     assert summary["resumed"] > 0
 
 
+@final
+class Poison(AbstractPlace):
+    """Kills who reads it, as the kernel does where memory runs out."""
+
+    key = name = "poison"
+
+    def read(self) -> Scene:
+        os.kill(os.getpid(), signal.SIGKILL)
+        raise AssertionError
+
+
 @pytest.mark.slow
-def test_a_worker_that_is_killed_is_one_line(tmp_path: Path, capsys) -> None:
-    """As the kernel does where memory runs out."""
-    path, out = tmp_path / "a.rec", tmp_path / "a.bank"
-    shard(path, *(f"scene {number}" for number in range(60)))
-    process = begun(path, out)
-    command = "spawn_main"
-    worker = next(
-        child
-        for child in children(process.pid)
-        if command in Path(f"/proc/{child}/cmdline").read_text()
-    )
-    os.kill(worker, signal.SIGKILL)
-    _, errors = process.communicate()
-    assert process.returncode == 2
-    assert "a process was killed" in errors and "Traceback" not in errors
-    shutil.rmtree(work_folder(out))
+def test_a_scene_that_kills_its_process_is_told(tmp_path: Path) -> None:
+    """The others are converted, in order."""
+    path, work = tmp_path / "a.rec", tmp_path / "work"
+    shard(path, *(f"scene {number}" for number in range(20)))
+    work.mkdir()
+    places = list(places_in([path]))
+    places.insert(6, Poison())
+    conversion = Conversion(folder=work, workers=2)
+    made = list(converted(places, conversion))
+    assert ids(made) == [f"scene {number}" for number in range(20)]
+    assert "the process that converted it was killed" in str(made[6].result)
+    many = [*places, *(Poison() for _ in range(3))]
+    with pytest.raises(SceneError, match="poison: the process"):
+        list(converted(many, conversion))
