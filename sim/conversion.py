@@ -6,8 +6,8 @@ the options and this package's own source: what has changed in the meantime is
 converted anew, all else is found again. At most a few scenes per worker wait, so that
 memory does not grow with the number of scenes (but for a few hundred bytes each).
 
-Where a worker is killed (as for want of memory), what waited then is converted again, one
-scene at a time, which tells whose fault it was; the others go on.
+Where a worker is killed (as for want of memory), what waited then is converted again,
+one scene at a time, which tells whose fault it was; the others go on.
 
 Workers end when the pipe that they hold the reading end of is closed, which the kernel
 does when the caller's process is killed: none outlives it, and none is waited for.
