@@ -13,7 +13,8 @@ Treiber and Kanagaraj's ballistic one (Physica A 419, 2015): v' = max(0, v + a d
 Leaders are all objects whose boxes stand in the corridor ahead, which is as wide as the
 own box and a margin and follows the path from the front bumper on; the one that asks
 for the hardest braking decides. Closing speeds are taken along the path. Other
-objects are where they are now; nothing is predicted.
+objects are where they are now; nothing is predicted: of two that merge side by side,
+or whose paths cross, none yields before one is in the other's corridor.
 
 Lines to stop at (`sim.stop_lines`) are standing leaders.
 
