@@ -225,18 +225,14 @@ class BcReporter:
             self.write({})
 
     def write(self, more: dict[str, float]) -> None:
-        """One row of the averages since the last."""
-        if not self._steps:
-            return
+        """One row of the averages since the last, where there was an update since."""
         wall = max(time.monotonic() - self._written, 1e-9)
-        rendered = sum(step.rendered_s for step in self._steps)
-        values = {
-            "loss": float(np.mean([step.result.loss for step in self._steps])),
-            "updates_per_s": len(self._steps) / wall,
-            "rendered_share": rendered / wall,
-            "seconds": self.elapsed_s,
-        }
-        self._curves.write(self._learner.updates, values | more)
+        values = {"seconds": self.elapsed_s, **more}
+        if self._steps:
+            values["loss"] = float(np.mean([step.result.loss for step in self._steps]))
+            values["updates_per_s"] = len(self._steps) / wall
+            values["rendered_share"] = sum(s.rendered_s for s in self._steps) / wall
+        self._curves.write(self._learner.updates, values)
         self._steps, self._written = [], time.monotonic()
 
     def save(self) -> None:
