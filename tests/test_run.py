@@ -166,7 +166,7 @@ def test_a_run_ends_with_scores_and_a_recording(tmp_path: Path) -> None:
         pass
     agents = json.loads((folder / "evaluation.json").read_text())["agents"]
     assert [agent["agent"] for agent in agents] == [
-        *("trained", "untrained", "random", "constant-speed", "expert")
+        *("trained", "untrained", "random", "constant-speed", "idm", "expert")
     ]
     assert agents[-1]["failure_rate"] == 0.0
     assert (folder / "evaluation.rrd").stat().st_size > 10_000
