@@ -140,6 +140,18 @@ def _view(words: list[str], prog: str) -> int:
     return view_command(_parse(ViewConfig, words, prog))
 
 
+def _replay_stats(words: list[str], prog: str) -> int:
+    from launch.replay_stats import StatsConfig, stats_command
+
+    return stats_command(_parse(StatsConfig, words, prog))
+
+
+def _export(words: list[str], prog: str) -> int:
+    from launch.export import ExportConfig, export_command
+
+    return export_command(_parse(ExportConfig, words, prog))
+
+
 def _role(words: list[str], prog: str) -> int:
     from launch.processes import run_role
 
@@ -157,6 +169,8 @@ COMMANDS: Final = {
     "view": Command("shows a run in progress or a recording", _view),
     "bench sim": Command("measures the simulator", _sim),
     "bench pipeline": Command("measures a run of the quick preset", _pipeline),
+    "replay stats": Command("says how a run's replay fares", _replay_stats),
+    "replay export": Command("writes a replay to a file for offline RL", _export),
     "replay": Command("one role of a run: the replay service", _role),
     "actor": Command("one role of a run: an actor", _role),
     "learner": Command("one role of a run: the learner", _role),

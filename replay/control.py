@@ -23,6 +23,9 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 MessageT = TypeVar("MessageT", bound=Message)
 
 
+PERCENTILES = (0, 5, 25, 50, 75, 95, 100)
+
+
 @final
 class WriterStats(Message, frozen=True, kw_only=True):
     """What the service knows of one writer."""
@@ -32,6 +35,7 @@ class WriterStats(Message, frozen=True, kw_only=True):
     next_sequence: Count  # the one that will be accepted next
     rows: Count  # stored from all its epochs
     pending: Count  # batches waiting for the limiter
+    lag_s: float  # since its last batch was stored, or since the service started
 
 
 @final
@@ -60,6 +64,20 @@ class StatsReply(Message, frozen=True, kw_only=True, tag=True):
     mean_priority_mass: float  # of the rows in the table
     durable: bool  # rows outlive the service's process
     fault: str  # why nothing can be stored at present; empty if it can
+    sampler: str
+    max_times_sampled: Count
+    tolerance: float  # samples
+    debt: float  # samples that the inserted rows still allow; 0 at the exact ratio
+    uptime_s: float
+    insert_rate: float  # rows/s, over the last ten seconds
+    sample_rate: float
+    ages: list[float]  # rows inserted since; at `PERCENTILES`, of 4096 rows at most
+    priorities: list[float]
+    row_bytes: Count  # of a transition, in memory and in a message
+    table_bytes: Count  # rows, columns and tree at full capacity
+    resident_bytes: Count  # of the service's process
+    disk_bytes: Count  # of a durable replay's files
+    recovered: Count  # rows found when the service started
     writers: list[WriterStats]
 
 

@@ -1,12 +1,19 @@
 """What the service counts, and the answer to who asks."""
 
-from dataclasses import dataclass
+import time
+from collections import deque
+from dataclasses import dataclass, field
 from typing import final
 
-from replay.control import StatsReply, WriterStats
+import numpy as np
+import psutil
+
+from replay.control import PERCENTILES, StatsReply, WriterStats
 from replay.ledger import Ledger
 from replay.local import LocalReplay
 from replay.requests import HeldInsert
+
+_RATE_LOOKS = 11  # a second apart: the rates are over ten seconds
 
 
 @final
@@ -21,6 +28,26 @@ class Counters:
     duplicates: int = 0
     gaps: int = 0
     refused: int = 0
+    began: float = field(default_factory=time.monotonic)
+    recovered: int = 0  # rows found at the start
+    history: deque[tuple[float, int, int]] = field(
+        default_factory=lambda: deque(maxlen=_RATE_LOOKS)
+    )
+    """(time, inserts, samples), a look a second."""
+
+    def look(self, replay: LocalReplay) -> None:
+        """Notes the counters about once a second, for the rates."""
+        now = time.monotonic()
+        if not self.history or now - self.history[-1][0] >= 1.0:
+            self.history.append((now, replay.inserts, replay.samples))
+
+    def rates(self, replay: LocalReplay) -> tuple[float, float]:
+        """Inserts and samples per second since the oldest look."""
+        if not self.history:
+            return 0.0, 0.0
+        then, inserts, samples = self.history[0]
+        passed = max(time.monotonic() - then, 1e-3)
+        return (replay.inserts - inserts) / passed, (replay.samples - samples) / passed
 
 
 def stats_reply(
@@ -32,6 +59,9 @@ def stats_reply(
     pending_samples: int,
 ) -> StatsReply:
     """All counters as they are now."""
+    now = time.monotonic()
+    insert_rate, sample_rate = counters.rates(replay)
+    ages, priorities = replay.table.ages_and_priorities()
     writers = [
         WriterStats(
             writer=state.writer,
@@ -39,6 +69,7 @@ def stats_reply(
             next_sequence=state.next_sequence,
             rows=state.rows,
             pending=len(state.waiting),
+            lag_s=now - max(state.stored_at, counters.began),
         )
         for state in ledger
     ]
@@ -65,5 +96,26 @@ def stats_reply(
         mean_priority_mass=replay.table.mean_mass(),
         durable=replay.durable is not None,
         fault=replay.fault,
+        sampler=replay.config.sampler,
+        max_times_sampled=replay.config.max_times_sampled,
+        tolerance=replay.limiter.tolerance,
+        debt=replay.limiter.debt(inserts=replay.inserts, samples=replay.samples),
+        uptime_s=now - counters.began,
+        insert_rate=insert_rate,
+        sample_rate=sample_rate,
+        ages=_percentiles(ages),
+        priorities=_percentiles(priorities),
+        row_bytes=replay.spec.row_bytes,
+        table_bytes=replay.table.memory_bytes,
+        resident_bytes=psutil.Process().memory_info().rss,
+        disk_bytes=replay.durable.disk_bytes if replay.durable else 0,
+        recovered=counters.recovered,
         writers=writers,
     )
+
+
+def _percentiles(values: np.ndarray) -> list[float]:
+    """At `PERCENTILES`; none of nothing."""
+    if not len(values):
+        return []
+    return [float(value) for value in np.percentile(values, PERCENTILES)]

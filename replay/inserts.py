@@ -176,8 +176,9 @@ class InsertDesk:
             life=state.life,
         )
         self._replay.insert_bytes(rows, mark)
-        self.ledger.stored(state, len(rows))
-        self._counters.insert_wait_s += time.monotonic() - held.arrived
+        now = time.monotonic()
+        self.ledger.stored(state, len(rows), now)
+        self._counters.insert_wait_s += now - held.arrived
         self._acknowledge(held, Status.OK)
         return True
 

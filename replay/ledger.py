@@ -50,6 +50,7 @@ class WriterState(Generic[T]):
     next_sequence: int
     life: int  # of the process that writes
     rows: int = 0  # stored, of all epochs
+    stored_at: float = 0.0  # when its last batch was, by the caller's clock
     waiting: deque[T] = field(default_factory=deque)  # from next_sequence on
 
     @property
@@ -103,8 +104,9 @@ class Ledger(Generic[T]):
             return Verdict.REPLACES, state
         return (Verdict.NEXT if sequence == state.expected else Verdict.GAP), state
 
-    def stored(self, state: WriterState[T], rows: int) -> None:
+    def stored(self, state: WriterState[T], rows: int, now: float = 0.0) -> None:
         """The first waiting batch is in the table."""
+        state.stored_at = now
         state.waiting.popleft()
         state.next_sequence += 1
         state.rows += rows

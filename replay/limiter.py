@@ -74,6 +74,10 @@ class RateLimiter:
         """Samples that the inserted rows still allow, 0 at the exact ratio."""
         return (inserts - self.min_size) * self.samples_per_insert - samples
 
+    def debt(self, *, inserts: int, samples: int) -> float:
+        """Samples that the inserted rows still allow, 0 at the exact ratio."""
+        return self._owed(inserts, samples)
+
     def may_insert(self, n: int, *, inserts: int, deletes: int, samples: int) -> bool:
         """Whether `n` more rows may be inserted at once."""
         if inserts + n - deletes <= self.min_size:

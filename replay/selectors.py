@@ -59,6 +59,17 @@ class AbstractSelector(abc.ABC):
     def total(self, live: int) -> float:
         """The sum of the masses of the `live` rows that can be drawn."""
 
+    @abc.abstractmethod
+    def priorities(
+        self, slots: Int64[np.ndarray, " rows"]
+    ) -> Float[np.ndarray, " rows"]:
+        """What the slots were given."""
+
+    @property
+    @abc.abstractmethod
+    def memory_bytes(self) -> int:
+        """What it takes."""
+
 
 @final
 class UniformSelector(AbstractSelector):
@@ -87,6 +98,17 @@ class UniformSelector(AbstractSelector):
     def total(self, live: int) -> float:
         """As many as there are."""
         return float(live)
+
+    def priorities(
+        self, slots: Int64[np.ndarray, " rows"]
+    ) -> Float[np.ndarray, " rows"]:
+        """All one: they are not kept."""
+        return np.ones(len(slots))
+
+    @property
+    def memory_bytes(self) -> int:
+        """Nothing."""
+        return 0
 
 
 @final
@@ -145,6 +167,17 @@ class PrioritizedSelector(AbstractSelector):
     def total(self, live: int) -> float:
         """See the base class."""
         return float(self._tree.query(0, self._capacity))
+
+    def priorities(
+        self, slots: Int64[np.ndarray, " rows"]
+    ) -> Float[np.ndarray, " rows"]:
+        """See the base class."""
+        return self._tree.at(slots) ** (1.0 / self._exponent)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Two float64 per leaf, of which there are a power of two."""
+        return 16 << (self._capacity - 1).bit_length()
 
 
 def make_selector(

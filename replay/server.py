@@ -79,7 +79,7 @@ class ReplayServer:
         self._events = queue.SimpleQueue()
         self._samples: deque[HeldSample] = deque()
         self._syncs: deque[tuple[int, zenoh.Query, StatsReply]] = deque()
-        self._counters = Counters()
+        self._counters = Counters(recovered=self._replay.size)
         self._inserts = InsertDesk(
             spec=spec,
             replay=self._replay,
@@ -279,6 +279,7 @@ class ReplayServer:
 
     def _tend_disk(self) -> None:
         """Starts the snapshot that is due, answers those who waited for one."""
+        self._counters.look(self._replay)
         durable = self._replay.durable
         if durable is None:
             return

@@ -315,6 +315,24 @@ class Table:
         probabilities = self._selector.masses(slots) / max(total, 1e-300)
         return ids.astype(np.uint64), probabilities, self._rows[slots]
 
+    def ages_and_priorities(
+        self, most: int = 4096
+    ) -> tuple[Int64[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+        """Rows inserted since, and priority, of up to `most` rows spread evenly."""
+        slots = self._window.slots()
+        slots = slots[:: max(1, len(slots) // most)]
+        slots = slots[self._live(slots)]
+        ages = self.inserts - 1 - self._ids_of(slots)
+        return ages, self._selector.priorities(slots)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Rows, the columns beside them and the selector, once the table is full."""
+        storage = self._storage
+        columns = (storage.rows, storage.priorities, storage.times)
+        stored = sum(column.nbytes for column in columns if column is not None)
+        return stored + self._selector.memory_bytes
+
     def mean_mass(self) -> float:
         """Mean of p^alpha over the rows in the table; 0 when it is empty."""
         if self.size == 0:

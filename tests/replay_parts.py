@@ -91,13 +91,14 @@ def service(
     spec: RowSpec = SPEC,
     folder: Path | None = None,
     largest: tuple[int, int] | None = None,
+    keys: RunKeys = KEYS,
 ) -> Iterator[Service]:
     """A replay service in a thread of this process, over a real TCP link."""
     endpoint = free_endpoint()
     router = open_session(listen=[endpoint], router=True)
     server = ReplayServer(
         session=router,
-        keys=KEYS,
+        keys=keys,
         spec=spec,
         config=config,
         seed=seed,

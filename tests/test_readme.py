@@ -11,7 +11,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 SHORT = ("doctor", "scenes", "evaluate")
-WORDS = {"scenes": 2, "train": 2, "bench": 2}  # a command's words; 1 otherwise
+WORDS = {
+    "scenes": 2,
+    "train": 2,
+    "bench": 2,
+    "replay": 2,
+}  # a command's words; 1 otherwise
 
 
 def commands() -> list[list[str]]:

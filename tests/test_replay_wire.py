@@ -127,8 +127,24 @@ SMALL_MESSAGES: list[control.Message] = [
         mean_priority_mass=1.0,
         durable=True,
         fault="",
+        sampler="uniform",
+        max_times_sampled=0,
+        tolerance=1.0,
+        debt=-0.5,
+        uptime_s=1.0,
+        insert_rate=1.0,
+        sample_rate=1.0,
+        ages=[0.0],
+        priorities=[1.0],
+        row_bytes=64,
+        table_bytes=64,
+        resident_bytes=1,
+        disk_bytes=0,
+        recovered=0,
         writers=[
-            control.WriterStats(writer=1, epoch=2, next_sequence=3, rows=4, pending=5)
+            control.WriterStats(
+                writer=1, epoch=2, next_sequence=3, rows=4, pending=5, lag_s=0.5
+            )
         ],
     ),
 ]
