@@ -29,6 +29,7 @@ from sim.dynamics import ObjectState
 from sim.environment import EnvironmentConfig, State
 from sim.observation import observation_sizes, observe_batch
 
+_GATHERED = 1 << 16  # rows whose states are gathered at once: the rest is memory
 _CHUNK = 1024  # rows whose distances to all of a grid's actions are in memory at once
 
 
@@ -64,8 +65,8 @@ def moving_vehicles(
 
 @functools.partial(jax.jit, static_argnames="config")
 def expert_actions(
-    states_tm1: Float[Array, "rows 5"],
-    states_t: Float[Array, "rows 5"],
+    states_tm1: Float[Array | np.ndarray, "rows 5"],
+    states_t: Float[Array | np.ndarray, "rows 5"],
     config: EnvironmentConfig,
 ) -> ExpertActions:
     """The actions that lead from each state to the following, in the config's space."""
@@ -110,17 +111,25 @@ def expert_rows(
     pairs = known[:, steps] & known[:, steps + 1] & (steps[None] + 1 < lasts)
     which, at = np.nonzero(pairs)
     scene, objects, step_t = scene[which], objects[which], steps[at] + 1
-    wanted = step_t[:, None] + np.arange(-history, 1)
-    seen = np.maximum(wanted, 0)
-    row = log[scene[:, None], seen, objects[:, None]]
-    states = row[..., [0, 1, 3, 4, 5]].astype(np.float32)
-    acted = expert_actions(states[:, -2], states[:, -1], config)
     rows = np.zeros(
         len(scene), row_spec(history, len(action_limits(config.action))).dtype
     )
     rows["scene"], rows["step"], rows["controlled"] = scene, step_t, objects
-    rows["states"] = states
-    rows["valid"] = there[scene[:, None], seen, objects[:, None]] & (wanted >= 0)
+    for first in range(0, len(rows), _GATHERED):
+        part = rows[first : first + _GATHERED]
+        wanted = part["step"][:, None] + np.arange(-history, 1)
+        at = (
+            part["scene"][:, None],
+            np.maximum(wanted, 0),
+            part["controlled"][:, None],
+        )
+        part["states"] = log[cells][..., [0, 1, 3, 4, 5]]
+        part["valid"] = there[cells] & (wanted >= 0)
+    acted = expert_actions(
+        np.ascontiguousarray(rows["states"][:, -2]),
+        np.ascontiguousarray(rows["states"][:, -1]),
+        config,
+    )
     rows["action"] = acted.on_grid
     rows["continuous"] = acted.continuous
     rows["discount"] = 1.0
