@@ -118,7 +118,7 @@ def expert_rows(
     for first in range(0, len(rows), _GATHERED):
         part = rows[first : first + _GATHERED]
         wanted = part["step"][:, None] + np.arange(-history, 1)
-        at = (
+        cells = (
             part["scene"][:, None],
             np.maximum(wanted, 0),
             part["controlled"][:, None],
