@@ -167,6 +167,7 @@ def quick_cloning() -> ExperimentConfig:
             batch_size=128,
             max_gradient_norm=5.0,
             average_updates=1000,
+            torch_threads=2,  # no actors beside it
         ),
     )
 
@@ -177,7 +178,10 @@ def laptop_cloning() -> ExperimentConfig:
         quick_cloning(),
         network=laptop_network(),
         cloning=CloningConfig(
-            learning_rate=5e-4, max_gradient_norm=5.0, average_updates=2000
+            learning_rate=5e-4,
+            max_gradient_norm=5.0,
+            average_updates=2000,
+            torch_threads=2,
         ),
         budget=BudgetConfig(updates=1_000_000, minutes=35.0),
         scenes=ScenesConfig(train=2000, held_out=200),
