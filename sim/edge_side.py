@@ -4,9 +4,9 @@ The drivable side is an edge's left. Where the nearest point is a polyline's ver
 adjoining segments decide: in a left turn the point must be left of both, in a right
 turn left of either. Differences of height count twice in the distance. Exact up to
 float32 within the grid (10 m around map and logs): the cell's candidates hold every
-edge that can be the nearest (`sim.edge_table`), at most `convert.MAX_CANDIDATES`, which
-no real scene at hand exceeds by more than a few cells. Outside the grid the border
-cell's candidates decide.
+edge that can be the nearest (`sim.edge_table`), the nearest `convert.MAX_CANDIDATES` to
+its centre where there are more (no real scene at hand comes near that). Outside the
+grid the border cell's candidates decide.
 
 Most points lie in cells that are all of one side; of the others most have few
 candidates. On a CPU only what is left is worked through, in blocks: measured on a
