@@ -10,8 +10,8 @@ grid the border cell's candidates decide.
 
 Most points lie in cells that are all of one side; of the others most have few
 candidates. On a CPU only what is left is worked through, in blocks: measured on a
-WOMD scene 0.2 us per box of four points, against 1.5 us for all candidates of every
-point. Batched by `jax.vmap` all points still make one list.
+WOMD scene, a step of an object without its observation takes 1.2 us so, 3.1 with all
+candidates of every point. Batched by `jax.vmap` all points still make one list.
 """
 
 from typing import NamedTuple

@@ -196,14 +196,13 @@ def advance(
     )
     overlap, offroad = failures(bank, state.scene, step_t, state.controlled, now)
     position = _position(bank, state.scene, state.controlled, now)
-    gained = _credit(bank, state.scene, step_t, state.controlled, position.along)
-    gained -= _credit(bank, state.scene, state.step, state.controlled, state.along)
-    near = jnp.maximum(1.0 - (position.aside / config.progress_width) ** 2, 0.0)
-    reward = (
-        config.progress * gained * near
-        - config.overlap_penalty * overlap.astype(jnp.float32)
-        - config.offroad_penalty * offroad.astype(jnp.float32)
-    )
+    reward = jnp.where(overlap, -config.overlap_penalty, 0.0)
+    reward += jnp.where(offroad, -config.offroad_penalty, 0.0)
+    if config.progress:  # two searches of every route, of no use to the paper's reward
+        gained = _credit(bank, state.scene, step_t, state.controlled, position.along)
+        gained -= _credit(bank, state.scene, state.step, state.controlled, state.along)
+        near = jnp.maximum(1.0 - (position.aside / config.progress_width) ** 2, 0.0)
+        reward += config.progress * gained * near
     last = step_t >= bank.steps[state.scene] - 1
     following = State(
         scene=state.scene,

@@ -10,6 +10,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Bool, Float, Int
 
 LANES = 32
@@ -57,9 +58,23 @@ def nearest(
     index = jnp.arange(n, dtype=jnp.int32).reshape((1,) * (squared.ndim - 1) + (-1,))
     bits = jax.lax.bitcast_convert_type(squared, jnp.int32)
     keys = jnp.where(seen, (bits & ~low) | index, _NONE)
-    pieces = [keys[..., start : start + LANES] for start in range(0, n, LANES)]
+    # Fused, every minimum would work the keys out anew; a call that XLA may not inline
+    # has them as its argument.
+    apart = {"inlineable": "false"} if jax.default_backend() == "cpu" else {}
+    with set_xla_metadata(**apart):  # type: ignore[no-untyped-call]
+        keys = _least(keys, count=count)
+    used = keys < _NONE
+    return jnp.where(used, keys & low, 0), used
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _least(keys: Int[Array, "*rows n"], count: int) -> Int[Array, "*rows count"]:
+    """The `count` least keys of each row, in order; no two are equal but `_NONE`."""
+    pieces = [
+        keys[..., start : start + LANES] for start in range(0, keys.shape[-1], LANES)
+    ]
     found: list[Int[Array, "*rows"]] = []
-    least = jnp.full(squared.shape[:-1], -1, jnp.int32)
+    least = jnp.full(keys.shape[:-1], -1, jnp.int32)
     for _ in range(count):
         after = least[..., None]
         least = functools.reduce(
@@ -67,6 +82,4 @@ def nearest(
             [jnp.where(piece > after, piece, _NONE).min(-1) for piece in pieces],
         )
         found.append(least)
-    keys = jnp.stack(found, -1)
-    used = keys < _NONE
-    return jnp.where(used, keys & low, 0), used
+    return jnp.stack(found, -1)

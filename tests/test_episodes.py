@@ -134,3 +134,13 @@ def test_a_step_compiles_once(made: BankFile) -> None:
         action = jnp.full((3, 1), number, jnp.int32)
         state, _, _ = step(jax.random.key(number), made.bank, begin, state, action)
     assert len(traces) == 1
+
+
+def test_an_environment_of_64_controlled_objects_is_small(made: BankFile) -> None:
+    """At most 16 KB between two steps, the bank and the shared starts aside."""
+    config = EnvironmentConfig()
+    state = jax.eval_shape(
+        lambda bank: episodes.starts(bank, NearestToSdc(64), config), made.bank
+    )
+    sizes = [value.size * value.dtype.itemsize for value in jax.tree.leaves(state)]
+    assert sum(sizes) / made.scenes <= 16 * 1024

@@ -216,3 +216,17 @@ def test_a_scene_of_empty_slots_is_over(made: BankFile) -> None:
     state = _reset(made.bank, jnp.int32(0), np.full(6, none, np.int32), CONFIG)
     _, outcome = _step(made.bank, state, np.zeros(6, np.int32), CONFIG)
     assert bool(outcome.truncated)
+
+
+def test_judging_and_observing_compile_once(pair: BankFile) -> None:
+    state = _reset(pair.bank, jnp.int32(0), jnp.array([0, 1]), CONFIG)
+    judged, judge_traces = scenes.counted(
+        lambda before, after: environment.judge(pair.bank, before, after, CONFIG.dt)
+    )
+    seen, observe_traces = scenes.counted(lambda view: observe(pair.bank, view, LOOK))
+    for action in (0, 1):
+        after, _ = _step(pair.bank, state, np.full(2, action, np.int32), CONFIG)
+        judged(state, after)
+        seen(after.view)
+        state = after
+    assert len(judge_traces) == len(observe_traces) == 1
