@@ -5,9 +5,10 @@
         tensorboard/         the same curves                 checkpoints/
         evaluation.json .md .rrd   scores and a recording    status.json
 
-One replay service (critical), a learner that ends the run and is started again from
-its newest checkpoint, and actors that are started again are processes of their own,
-connected over Zenoh on loopback. With `serial` they take turns in this process.
+One replay service (critical unless it is durable), a learner that ends the run and is
+started again from its newest checkpoint, and actors that are started again are
+processes of their own, connected over Zenoh on loopback. With `serial` they take turns
+in this process.
 """
 
 import asyncio
@@ -213,7 +214,8 @@ def roles_of(folder: Path, run: RunFile, port: int, placement: Placement) -> lis
                 *placement.listen,
                 *(("--insecure",) if placement.insecure else ()),
             ),
-            critical=True,
+            # A durable one goes on where it was killed; another has lost its rows.
+            critical=not run.config.replay.durable,
             port=port,
         ),
         Role(
