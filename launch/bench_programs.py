@@ -86,7 +86,7 @@ def rollout(
         decision = agent(unused, bank, state)
         following, outcome = advance(bank, state, decision.moved, config)
         if road is None:
-            judged = judge(bank, state, following, config.dt)
+            judged = judge(bank, state, following, config.dt, outcome)
             reward = outcome.reward
         else:
             judged = bench_oracle.judge(

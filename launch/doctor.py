@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal
 
+import numpy as np
 import psutil
 from rich.console import Console
 from rich.table import Table
@@ -33,7 +34,7 @@ PACKAGES: Final = {
     "matplotlib": "learner",
     "rerun-sdk": "viewer",
 }
-_PAYLOAD: Final = 1 << 20  # bytes, large enough to go by shared memory
+_VALUES: Final = 1 << 18  # float32, large enough to go by shared memory
 
 
 @dataclass(frozen=True)
@@ -147,10 +148,10 @@ def ports() -> Finding:
 
 
 def zenoh_loopback(shared_memory: bool) -> Finding:
-    """A file of 1 MB asked for and answered between two sessions."""
-    from replay.channels import ControlSubscriber, send_stop
+    """Weights of 1 MB published by one session and had by another."""
     from replay.keys import RunKeys
     from replay.session import open_session
+    from replay.weights import WeightsPublisher, WeightsSubscriber
 
     name = "zenoh, shared memory" if shared_memory else "zenoh, tcp"
     endpoint, keys = f"tcp/127.0.0.1:{_free_port()}", RunKeys("doctor")
@@ -160,15 +161,12 @@ def zenoh_loopback(shared_memory: bool) -> Finding:
         ) as router,
         open_session(connect=[endpoint], shared_memory=shared_memory) as client,
     ):
-        listening = ControlSubscriber(router, keys)
+        publisher = WeightsPublisher(session=router, keys=keys)
+        publisher.publish(version=0, layout_hash="doctor", vector=np.zeros(_VALUES))
         began = time.perf_counter()
-        deadline = began + 5.0
-        # A subscription takes a moment to be known to the other side.
-        while not listening.stop.wait(0.01) and time.perf_counter() < deadline:
-            send_stop(client, keys, "x" * _PAYLOAD)
+        arrived = WeightsSubscriber(session=client, keys=keys).wait(timeout=5.0)
         took = time.perf_counter() - began
-        arrived = listening.stop.is_set()
-    if not arrived:
+    if arrived is None:
         advice = "check that loopback is up and no firewall filters it"
         return Finding(name, "error", "no message arrived within 5 s", advice)
     return Finding(name, "ok", f"1 MB arrived within {took * 1e3:.0f} ms")

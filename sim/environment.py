@@ -273,12 +273,25 @@ def failures(
     return overlap & there, offroad & there
 
 
-def judge(bank: Bank, state_tm1: State, state_t: State, dt: float) -> Judgement:
-    """All metrics of the step that led from one state to the next, `dt` seconds."""
+def judge(
+    bank: Bank,
+    state_tm1: State,
+    state_t: State,
+    dt: float,
+    outcome: Outcome | None = None,
+) -> Judgement:
+    """All metrics of the step that led from one state to the next, `dt` seconds.
+
+    `outcome`, where `advance` gave it for this very step, spares looking for overlap
+    and off-road again: half of an expert's rollout.
+    """
     before, now = state_tm1.history[:, -1], state_t.history[:, -1]
     place = (bank, state_t.scene, state_t.step, state_t.controlled)
     valid = recorded(*place)
-    overlap, offroad = failures(*place, now)
+    if outcome is None:
+        overlap, offroad = failures(*place, now)
+    else:
+        overlap, offroad = outcome.overlap, outcome.offroad
     logged = logged_states(*place)
     divergence = jax.vmap(metrics.log_divergence)(
         now[:, 0], now[:, 1], logged[:, 0], logged[:, 1]

@@ -25,9 +25,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Bool, Float, Int
 
+from sim.apart import apart
 from sim.bank import Bank
 from sim.features import (
     AGENT_FEATURES,
@@ -200,9 +200,7 @@ def observe_batch(bank: Bank, view: View, config: ObservationConfig) -> Observat
     alone = view.controlled.shape == (1, 1)
     if alone:
         view = jax.tree.map(lambda value: jnp.concatenate([value, value]), view)
-    apart = {"inlineable": "false"} if jax.default_backend() == "cpu" else {}
-    with set_xla_metadata(**apart):  # type: ignore[no-untyped-call]
-        batched = _observe_views(bank, view, config=config)
+    batched = apart(_observe_views(bank, view, config=config))
     return jax.tree.map(lambda value: value[:1], batched) if alone else batched
 
 

@@ -10,8 +10,9 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Bool, Float, Int
+
+from sim.apart import apart
 
 LANES = 32
 _NONE = 2**31 - 1  # int32's largest
@@ -60,9 +61,7 @@ def nearest(
     keys = jnp.where(seen, (bits & ~low) | index, _NONE)
     # Fused, every minimum would work the keys out anew; a call that XLA may not inline
     # has them as its argument.
-    apart = {"inlineable": "false"} if jax.default_backend() == "cpu" else {}
-    with set_xla_metadata(**apart):  # type: ignore[no-untyped-call]
-        keys = _least(keys, count=count)
+    keys = apart(_least(keys, count=count))
     used = keys < _NONE
     return jnp.where(used, keys & low, 0), used
 

@@ -15,6 +15,13 @@ install_import_hook(
 import os  # noqa: E402
 from pathlib import Path  # noqa: E402
 
+# Many tests, and the processes that they start, compile the same programs: each is
+# compiled once. Set before JAX is imported, so that those processes have it too.
+CACHE = Path(__file__).parent.parent / ".pytest_cache" / "xla"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+
 import jax  # noqa: E402
 import pytest  # noqa: E402
 

@@ -265,6 +265,7 @@ def loop(
     return ticks, np.concatenate(written)
 
 
+@pytest.mark.slow
 def test_the_loop_is_determined_by_its_key(file: BankFile) -> None:
     """And by the weights at the time, whatever becomes of their buffer."""
     shown: list = []

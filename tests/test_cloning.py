@@ -139,7 +139,7 @@ def test_the_replay_takes_the_rows_and_draws_them_evenly(file):
     [
         pytest.param("bicycle", 3, "mode", marks=pytest.mark.slow),
         pytest.param("delta", 3, "mean", marks=pytest.mark.slow),
-        ("delta", 3, "sample"),
+        pytest.param("delta", 3, "sample", marks=pytest.mark.slow),
         pytest.param("bicycle", 0, "sample", marks=pytest.mark.slow),
     ],
 )

@@ -92,6 +92,7 @@ def test_only_the_judged_count_and_an_empty_slot_is_nobody(file: BankFile) -> No
     assert log.trace.states.shape[2] == 2
 
 
+@pytest.mark.slow
 def test_others_react_to_whoever_drives_among_them(file: BankFile) -> None:
     """Object 1 runs into object 0 in the log, and brakes behind it by IDM."""
     chosen = sdc_of(file)

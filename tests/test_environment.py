@@ -267,6 +267,7 @@ def test_a_batch_is_its_scenes(tmp_path: Path) -> None:
         np.testing.assert_allclose(state.history, batched_state.history[row], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_random_driving_stays_finite(tmp_path: Path) -> None:
     """Whatever the policy does, what it sees and gets are numbers."""
     file = scenes.bank_of(list(generate_many(4, 3)), tmp_path)

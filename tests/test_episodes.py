@@ -88,7 +88,7 @@ def idle_rollout(
     return results
 
 
-@pytest.mark.parametrize("slots", [1, 4])
+@pytest.mark.parametrize("slots", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_a_whole_step_is_its_parts(made: BankFile, slots: int) -> None:
     """Step, then restart what is over and nothing else, then observe."""
     begin = jax.device_get(episodes.starts(made.bank, NearestToSdc(slots), CONFIG))

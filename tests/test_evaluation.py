@@ -187,6 +187,7 @@ def test_a_scene_whose_log_stands_has_no_progress(tmp_path: Path) -> None:
     assert dataclasses.asdict(found.scenes[0])["id"] == "hand"
 
 
+@pytest.mark.slow
 def test_an_evaluation_is_determined_by_its_key(three: BankFile) -> None:
     one, same = (
         evaluate(

@@ -238,9 +238,9 @@ def test_the_time_axis_cuts_an_observation_where_its_features_end(tmp_path):
     @jax.jit
     def first(bank):
         state = environment.reset(bank, jnp.int32(0), bank.sdc[0][None], config)
-        return environment.observe_state(bank, state, 0, config)
+        return environment.observe_state(bank, state, config)
 
-    look = jax.tree.map(lambda x: np.asarray(x)[None], first(bank))
+    look = jax.tree.map(np.asarray, first(bank))
     ego, agents, valid, *_ = to_torch(look, torch.device("cpu"))
     own, others = split_over_time(ego, agents, valid, TIMES)
     assert own.features.shape == (1, TIMES, 1, EGO_NOW + EGO_POSE + 5 + 16)

@@ -109,6 +109,7 @@ def test_far_from_the_map_nothing_breaks(made: BankFile) -> None:
     assert not found.agents_valid.any()
 
 
+@pytest.mark.slow
 def test_the_real_scenes_bit_for_bit_in_batches_of_any_size(real) -> None:
     """All finite and of about unit range, too."""
     recorded, file = real

@@ -287,6 +287,9 @@ def trace_of(file: BankFile, steps: int, counted: int) -> Trace:
         infeasible=np.zeros(axes, bool),
         displacement=np.zeros(axes, np.float32),
         progress=np.full(axes, np.nan, np.float32),
+        wrong_way=np.zeros(axes, bool),
+        off_route=np.zeros(axes, bool),
+        progression=np.full(axes, np.nan, np.float32),
         counts=counts,
         step=np.tile(np.arange(11, 11 + steps), (scenes, 1)),
     )

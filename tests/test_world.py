@@ -126,9 +126,12 @@ def test_all_metrics_of_all_objects_are_the_oracles(made: BankFile) -> None:
     recorded = list(generate_many(31, 3))[1]
     for _ in range(25):
         action = rng.integers(0, CONFIG.action.count, objects).astype(np.int32)
-        after, _ = _step(made.bank, before, action, CONFIG)
+        after, outcome = _step(made.bank, before, action, CONFIG)
         found = jax.device_get(_judge(made.bank, before, after, CONFIG.dt))
         assert_judged(made, recorded, before, after, found)
+        known = environment.judge(made.bank, before, after, CONFIG.dt, outcome)
+        assert (found.overlap == known.overlap).all()
+        assert (found.offroad == known.offroad).all()
         before = after
 
 
