@@ -150,7 +150,7 @@ def steps(work: Work) -> Iterator[dict[str, Any]]:
         file = sized(work.scene, slots, work.folder).file
         row = measured(file, controlled, environments, 2 * work.seconds)
         share = recorded_share(file, controlled)
-        yield {"whole": slots == whole, "recorded_share": share, **row}
+        yield {"recorded_share": share, **row}
 
 
 def scale(work: Work) -> Iterator[dict[str, Any]]:

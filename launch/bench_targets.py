@@ -65,8 +65,8 @@ def _times(rows: Sequence[Row]) -> Iterator[Target]:
 def _rates(rows: Sequence[Row]) -> Iterator[Target]:
     for row in rows:
         size = (row["controlled"], row["environments"])
-        if size in AGENT_STEPS and row["whole"]:
-            label = f"agent-steps/s, {size[0]} x {size[1]}"
+        if size in AGENT_STEPS:
+            label = f"agent-steps/s, {size[0]} x {size[1]}, {row['slots']} objects"
             yield _at_least(label, AGENT_STEPS[size], row["agent_steps_per_s"])
         if row["slots"] == row["controlled"] == 64:
             state = row["state_bytes_per_environment"]
