@@ -228,6 +228,7 @@ def test_evaluation_counts_every_scene(
         assert ours["progression"] == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_several_agents_share_a_table(
     bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

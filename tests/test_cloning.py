@@ -96,6 +96,7 @@ def test_rows_from_the_first_step_on_have_a_short_history(file):
     assert (first["valid"] == [0, 0, 1, 1]).all()
 
 
+@pytest.mark.slow
 def test_rows_render_what_a_driver_sees(file):
     """At a scene's start the simulator's observation is the row's."""
     bank = file.bank

@@ -189,6 +189,7 @@ def test_untrained_weights_fill_the_layout() -> None:
     np.testing.assert_array_equal(weights, same)
 
 
+@pytest.mark.slow
 def test_greedy_takes_the_highest_q_value_of_every_object(tmp_path: Path) -> None:
     file = scenes.bank_of(list(generate_many(3, 1)), tmp_path)
     bank = file.bank

@@ -125,6 +125,7 @@ def test_stats_as_a_table_and_a_file(
     assert json.loads(out.read_text())["inserts"] == ROWS
 
 
+@pytest.mark.slow
 def test_an_export_is_what_was_stored_with_its_observations(
     run: Run, tmp_path: Path
 ) -> None:
