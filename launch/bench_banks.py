@@ -20,7 +20,7 @@ import numpy as np
 import psutil
 
 from launch import bench_child, bench_steps
-from launch.bench_programs import compiled, resets
+from launch.bench_programs import compiled, resets, waited
 from launch.bench_table6 import configuration
 from launch.bench_timing import timed
 from launch.scenes import write_procedural
@@ -53,13 +53,13 @@ def banks(
 
 def bank(request: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Opens one bank and measures; in a fresh process."""
-    _waited(jnp.zeros(1))  # JAX itself is up
+    waited(jnp.zeros(1))  # JAX itself is up
     process = psutil.Process()
     before = process.memory_info()
     began = time.perf_counter()
     file = open_bank(Path(request["path"]))
     opened = time.perf_counter()
-    arrays = _waited(file.bank)
+    arrays = waited(file.bank)
     loaded = time.perf_counter()
     grown = process.memory_info().rss - before.rss
     config = configuration(file.dt)
@@ -80,10 +80,6 @@ def bank(request: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     }
 
 
-def _waited(result: Any) -> Any:  # noqa: ANN401 - any tree of arrays
-    return jax.block_until_ready(result)  # type: ignore[no-untyped-call]
-
-
 def _resets(
     bank: Bank, config: EnvironmentConfig, seconds: float
 ) -> tuple[float, float]:
@@ -101,7 +97,7 @@ def _resets(
     turns = itertools.cycle([jnp.asarray(scenes) for scenes in drawn])
     program = jax.jit(jax.vmap(one, (None, 0))).lower(bank, next(turns)).compile()
     found = timed(
-        lambda: _waited(program(bank, next(turns))),
+        lambda: waited(program(bank, next(turns))),
         seconds=seconds,
     )
     return first_ms, found.median_ms * 1e3 / BATCH
@@ -112,5 +108,5 @@ def _starts(bank: Bank, config: EnvironmentConfig) -> float:
     function = jax.jit(lambda bank: episodes.starts(bank, episodes.sdc_only, config))
     program = function.lower(bank).compile()
     began = time.perf_counter()
-    _waited(program(bank))
+    waited(program(bank))
     return (time.perf_counter() - began) * 1e3

@@ -126,10 +126,11 @@ def compiled(function: Callable[..., Any], *arguments: Any) -> Program:  # noqa:
         temporary = int(memory.temp_size_in_bytes)
         peak = int(memory.argument_size_in_bytes + memory.output_size_in_bytes)
         peak += temporary - int(memory.alias_size_in_bytes)
-    return Program(lambda: _waited(program(*arguments)), peak, temporary)
+    return Program(lambda: waited(program(*arguments)), peak, temporary)
 
 
-def _waited(result: Any) -> Any:  # noqa: ANN401 - any tree of arrays
+def waited(result: Any) -> Any:  # noqa: ANN401 - any tree of arrays
+    """The result, once it is there."""
     return jax.block_until_ready(result)  # type: ignore[no-untyped-call]
 
 

@@ -283,7 +283,7 @@ def judge(
     """All metrics of the step that led from one state to the next, `dt` seconds.
 
     `outcome`, where `advance` gave it for this very step, spares looking for overlap
-    and off-road again: half of an expert's rollout.
+    and off-road again.
     """
     before, now = state_tm1.history[:, -1], state_t.history[:, -1]
     place = (bank, state_t.scene, state_t.step, state_t.controlled)
