@@ -6,7 +6,7 @@ Nothing here imports torch: an actor or a viewer does without it.
 import queue
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, final
 
 import msgspec
@@ -52,9 +52,11 @@ class _Request:
         self,
         updates: list[tuple[np.ndarray, np.ndarray]],
         events: "queue.SimpleQueue[tuple[_Request, bytes | None]]",
+        on_answer: Callable[[], object],
     ) -> None:
         self.updates = updates
         self._events = events
+        self._on_answer = on_answer
         self._answered = False
 
     def on_reply(self, reply: zenoh.Reply) -> None:
@@ -62,12 +64,14 @@ class _Request:
         if reply.ok is not None and not self._answered:
             self._answered = True
             self._events.put((self, reply.ok.payload.to_bytes()))
+            self._on_answer()
 
     def on_end(self) -> None:
         """An end without a reply is a failure, e.g. a service that was killed."""
         if not self._answered:
             self._answered = True
             self._events.put((self, None))
+            self._on_answer()
 
 
 @final
@@ -84,8 +88,12 @@ class Sampler:
         batches_per_reply: int = 1,
         in_flight: int = 2,
         hold_s: float = 2.0,
+        on_answer: Callable[[], object] = lambda: None,
     ) -> None:
-        """`hold_s`: how long the service may wait for its limiter per query."""
+        """`hold_s`: how long the service may wait for its limiter per query.
+
+        `on_answer` is called on Zenoh's thread when a query has ended.
+        """
         if min(batch_size, batches_per_reply, in_flight) < 1:
             raise ReplayError(
                 f"batch_size={batch_size}, batches_per_reply={batches_per_reply} and "
@@ -98,6 +106,7 @@ class Sampler:
         self._batches = batches_per_reply
         self._in_flight = in_flight
         self._hold_s = hold_s
+        self._on_answer = on_answer
         self._events: queue.SimpleQueue[tuple[_Request, bytes | None]]
         self._events = queue.SimpleQueue()
         self._outstanding = 0
@@ -157,7 +166,7 @@ class Sampler:
         kept = -(-len(self._ready) // self._batches)
         while self._outstanding + kept < self._in_flight:
             updates, self._updates = self._updates, []
-            request = _Request(updates, self._events)
+            request = _Request(updates, self._events, self._on_answer)
             message = SampleRequest(
                 batch_size=self._batch_size,
                 batches=self._batches,
@@ -224,6 +233,7 @@ def _batches_of(sample: Sample, batch_size: int) -> Iterator[Sample]:
             rows=sample.rows[part],
             size=sample.size,
             inserts=sample.inserts,
+            mass=sample.mass,
         )
 
 

@@ -193,6 +193,7 @@ class LocalReplay:
             rows=buffer.rows.reshape(-1).view(self.spec.dtype),
             size=self.size,
             inserts=self.inserts,
+            mass=self.table.mass(),
         )
 
     def sample_into_buffer(self, *, batch_size: int, batches: int) -> SampleReplyBuffer:

@@ -44,6 +44,7 @@ from replay.wire import (
 
 __all__ = ["ReplayConfig", "ReplayServer"]
 
+_QUESTIONS = ("fetch", "stats", "sync")
 _LONGEST_WAIT_S = 0.1  # between looks at the stop event
 _MAX_EVENTS = 4096  # unread
 _MAX_SAMPLES = 1024  # requests that wait for the limiter, or for the disk
@@ -63,12 +64,14 @@ class ReplayServer:
         seed: int = 0,
         folder: Path | None = None,
         largest: tuple[int, int] | None = None,
+        hub: zenoh.Session | None = None,
     ) -> None:
         """Makes the table, or takes up that of `folder` if the configuration says so.
 
         Requests are taken from `run` on. `largest`: rows of the run's largest batches,
         (insert, sample); larger ones are refused. Unless it is given, those that come
-        first decide which others could deadlock with them.
+        first decide which others could deadlock with them. `hub`: a further session,
+        on which questions are answered too, and no rows taken in or drawn.
         """
         self._session = session
         self._keys = keys
@@ -87,6 +90,7 @@ class ReplayServer:
             incarnation=self._incarnation,
             check_rows=lambda rows: self._check_batches(insert_rows=rows),
         )
+        self._hub = hub
         self._bounded = largest is not None
         # The largest batches seen, or that may come.
         self._insert_rows, self._sample_rows = largest or (1, 1)
@@ -109,6 +113,12 @@ class ReplayServer:
             self._session.declare_queryable(key, self._enqueue(name))
             for name, (key, _) in handlers.items()
         ]
+        if self._hub is not None:
+            queryables += [
+                self._hub.declare_queryable(key, self._enqueue(name))
+                for name, (key, _) in handlers.items()
+                if name in _QUESTIONS
+            ]
         self._ready.set()
         try:
             while not stop.is_set():
@@ -174,8 +184,7 @@ class ReplayServer:
             batch_size=held.message.batch_size, batches=held.message.batches
         )
         self._counters.sample_wait_s += time.monotonic() - held.arrived
-        payload = buffer.seal(size=self._replay.size, inserts=self._replay.inserts)
-        answer(held.query, payload)
+        answer(held.query, self._sealed(buffer))
         return True
 
     # Both
@@ -251,8 +260,13 @@ class ReplayServer:
         buffer.ids[:] = ids
         buffer.probabilities[:] = probabilities
         buffer.rows[:] = rows
-        size, inserts = self._replay.size, self._replay.inserts
-        answer(query, buffer.seal(size=size, inserts=inserts))
+        answer(query, self._sealed(buffer))
+
+    def _sealed(self, buffer: SampleReplyBuffer) -> bytearray:
+        """The reply, with what the table is now."""
+        replay = self._replay
+        mass = replay.table.mass()
+        return buffer.seal(size=replay.size, inserts=replay.inserts, mass=mass)
 
     def _on_stats(self, query: zenoh.Query, _: float) -> None:
         answer(query, encode(self.stats()))

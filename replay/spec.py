@@ -124,3 +124,4 @@ class Sample:
     rows: np.ndarray  # [batch], structured by the spec; may be read-only
     size: int  # rows in the table when they were drawn
     inserts: int  # rows ever inserted when they were drawn
+    mass: float  # sum over the table of what rows are drawn in proportion to

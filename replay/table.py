@@ -333,11 +333,13 @@ class Table:
         stored = sum(column.nbytes for column in columns if column is not None)
         return stored + self._selector.memory_bytes
 
+    def mass(self) -> float:
+        """Sum over the table of what rows are drawn in proportion to: p^alpha, or 1."""
+        return self._selector.total(self.size) if self.size else 0.0
+
     def mean_mass(self) -> float:
         """Mean of p^alpha over the rows in the table; 0 when it is empty."""
-        if self.size == 0:
-            return 0.0
-        return self._selector.total(self.size) / self.size
+        return self.mass() / max(1, self.size)
 
     def check_invariants(self) -> None:
         """Asserts what must hold after every operation; for tests."""

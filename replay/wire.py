@@ -17,9 +17,9 @@ and is padded to 64 bytes, so that rows behind it stay aligned.
     SampleRequest batch size u32, batches u32, updates u32, hold ms u32; then
                   ids u64[updates], priorities f64[updates]
     FetchRequest  limit u32, first id u64
-    SampleReply   status u16, rows u32, size u64, inserts u64; then ids u64[rows],
-                  probabilities f64[rows], rows; or the reason if refused. It also
-                  answers FetchRequest (size and inserts bound the ids that exist)
+    SampleReply   status u16, rows u32, size u64, inserts u64, mass f64; then
+                  ids u64[rows], probabilities f64[rows], rows; or the reason.
+                  It also answers FetchRequest (size and inserts bound the ids)
     Weights       values u32, version i64, layout hash ASCII[24]; then f32[values]
 """
 
@@ -33,7 +33,7 @@ from jaxtyping import Float, UInt8, UInt64
 
 from replay.spec import ReplayError, RowSpec, Sample
 
-WIRE_VERSION = 2
+WIRE_VERSION = 3
 MAGIC = b"SLST"
 HEADER_BYTES = 64
 MAX_ROWS = 1 << 20  # per message
@@ -73,7 +73,7 @@ class Status(enum.IntEnum):
 _INSERT = struct.Struct("<IIQQQIQ")
 _INSERT_REPLY = struct.Struct("<HxxIQQQ")
 _SAMPLE_REQUEST = struct.Struct("<IIII")
-_SAMPLE_REPLY = struct.Struct("<HxxIQQ")
+_SAMPLE_REPLY = struct.Struct("<HxxIQQd")
 _FETCH_REQUEST = struct.Struct("<IxxxxQ")
 _WEIGHTS = struct.Struct("<Ixxxxq24s")
 
@@ -311,9 +311,9 @@ class SampleReplyBuffer:
         rows = np.frombuffer(self.payload, np.uint8, offset=start + 16 * count)
         self.rows = rows.reshape(count, spec.row_bytes)
 
-    def seal(self, *, size: int, inserts: int) -> bytearray:
+    def seal(self, *, size: int, inserts: int, mass: float) -> bytearray:
         """Writes the header and returns the whole message."""
-        head = _SAMPLE_REPLY.pack(Status.OK, len(self.ids), size, inserts)
+        head = _SAMPLE_REPLY.pack(Status.OK, len(self.ids), size, inserts, mass)
         self.payload[:HEADER_BYTES] = _header(
             Kind.SAMPLE_REPLY, self._spec.schema_hash, head
         )
@@ -322,7 +322,7 @@ class SampleReplyBuffer:
 
 def encode_sample_refusal(status: Status, reason: str, spec: RowSpec) -> bytes:
     """A sample reply without rows: busy, or refused with a reason."""
-    head = _SAMPLE_REPLY.pack(status, 0, 0, 0)
+    head = _SAMPLE_REPLY.pack(status, 0, 0, 0, 0.0)
     return _header(Kind.SAMPLE_REPLY, spec.schema_hash, head) + reason.encode()
 
 
@@ -340,12 +340,11 @@ class SampleReply:
         """Parses and checks; the arrays are views of the payload."""
         kind = Kind.SAMPLE_REPLY
         _open(payload, kind, spec.schema_hash)
-        value, count, size, inserts = _SAMPLE_REPLY.unpack_from(payload, _COMMON.size)
-        status = _status(value, kind)
+        code, count, *told = _SAMPLE_REPLY.unpack_from(payload, _COMMON.size)
+        status, (size, inserts, mass) = _status(code, kind), told
         if status is not Status.OK:
-            return SampleReply(
-                status=status, reason=_reason(payload, kind), sample=None
-            )
+            reason = _reason(payload, kind)
+            return SampleReply(status=status, reason=reason, sample=None)
         _check_count(kind, "rows", count, MAX_ROWS)
         _check_length(payload, kind, count * (16 + spec.row_bytes))
         start = HEADER_BYTES
@@ -355,8 +354,11 @@ class SampleReply:
             rows=np.frombuffer(payload, spec.dtype, count, start + 16 * count),
             size=size,
             inserts=inserts,
+            mass=mass,
         )
-        if not (abs(sample.probabilities - 0.5) <= 0.5 + 1e-9).all():  # NaN is not
+        if not 0 <= mass < float("inf"):  # NaN is neither
+            raise WireError(f"{kind.name}: a mass of {mass}")
+        if not (abs(sample.probabilities - 0.5) <= 0.5 + 1e-9).all():
             raise WireError(f"{kind.name}: probabilities outside of [0, 1]")
         return SampleReply(status=status, reason="", sample=sample)
 

@@ -277,8 +277,13 @@ def test_replies_of_a_hostile_service_are_refused() -> None:
     buffer = SampleReplyBuffer(spec=SPEC, count=3)
     for bad in (float("nan"), -0.1, 2.0, float("inf")):
         buffer.probabilities[:] = [0.5, bad, 0.5]
-        payload = bytes(buffer.seal(size=3, inserts=3))
+        payload = bytes(buffer.seal(size=3, inserts=3, mass=3.0))
         with pytest.raises(WireError, match=r"outside of \[0, 1\]"):
+            SampleReply.decode(payload, SPEC)
+    buffer.probabilities[:] = 0.5
+    for bad in (float("nan"), -0.1, float("inf")):
+        payload = bytes(buffer.seal(size=3, inserts=3, mass=bad))
+        with pytest.raises(WireError, match="a mass of"):
             SampleReply.decode(payload, SPEC)
 
 

@@ -31,6 +31,7 @@ def draw(table: Table, batch_size: int, batches: int = 1) -> Sample:
         rows=rows.reshape(-1).view(SPEC.dtype),
         size=table.size,
         inserts=table.inserts,
+        mass=table.mass(),
     )
 
 

@@ -67,7 +67,7 @@ def sample_reply() -> bytes:
     buffer.ids[:] = [4, 2**40, 6]
     buffer.probabilities[:] = [0.1, 0.2, 0.3]
     buffer.rows[:] = SPEC.as_bytes(make_rows(10, 3))
-    return bytes(buffer.seal(size=100, inserts=2**40))
+    return bytes(buffer.seal(size=100, inserts=2**40, mass=2.5))
 
 
 def weights() -> Weights:
