@@ -16,7 +16,7 @@ from jaxtyping import Float, Integer
 
 from replay.control import StatsReply, decode
 from replay.keys import RunKeys
-from replay.session import ask
+from replay.session import ask, direct
 from replay.spec import ReplayError, RowSpec, Sample
 from replay.wire import (
     FetchRequest,
@@ -51,7 +51,7 @@ class _Request:
     def __init__(
         self,
         updates: list[tuple[np.ndarray, np.ndarray]],
-        events: "queue.SimpleQueue[tuple[_Request, bytes | None]]",
+        events: "queue.SimpleQueue[tuple[_Request, zenoh.ZBytes | None]]",
         on_answer: Callable[[], object],
     ) -> None:
         self.updates = updates
@@ -63,7 +63,7 @@ class _Request:
         """Hands the payload to the sampling thread."""
         if reply.ok is not None and not self._answered:
             self._answered = True
-            self._events.put((self, reply.ok.payload.to_bytes()))
+            self._events.put((self, reply.ok.payload))
             self._on_answer()
 
     def on_end(self) -> None:
@@ -107,7 +107,7 @@ class Sampler:
         self._in_flight = in_flight
         self._hold_s = hold_s
         self._on_answer = on_answer
-        self._events: queue.SimpleQueue[tuple[_Request, bytes | None]]
+        self._events: queue.SimpleQueue[tuple[_Request, zenoh.ZBytes | None]]
         self._events = queue.SimpleQueue()
         self._outstanding = 0
         self._ready: deque[Sample] = deque()
@@ -177,7 +177,7 @@ class Sampler:
             self._outstanding += 1
             self._session.get(
                 self._key,
-                zenoh.handlers.Callback(request.on_reply, request.on_end),
+                direct(request.on_reply, request.on_end),
                 payload=message.encode(self._spec),
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK,
@@ -201,7 +201,7 @@ class Sampler:
         while not self._events.empty():
             self._handle(*self._events.get())
 
-    def _handle(self, request: _Request, payload: bytes | None) -> None:
+    def _handle(self, request: _Request, payload: zenoh.ZBytes | None) -> None:
         """Keeps the rows of an answer; a failed query's updates are sent again."""
         self._outstanding -= 1
         if payload is None:
@@ -211,7 +211,7 @@ class Sampler:
             self._failures = min(self._failures + 1, 10)
             return
         self._failures, self._retry_at = 0, 0.0
-        reply = SampleReply.decode(payload, self._spec)
+        reply = SampleReply.decode(payload.to_bytes(), self._spec)
         if reply.status is Status.REFUSED:
             raise ReplayError(f"replay refused to sample: {reply.reason}")
         if reply.sample is not None:

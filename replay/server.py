@@ -29,7 +29,7 @@ from replay.keys import RunKeys
 from replay.limiter import LimiterError
 from replay.local import LocalReplay, ReplayConfig
 from replay.requests import HeldSample, answer, end, payload_of
-from replay.session import undeclare
+from replay.session import direct, undeclare
 from replay.spec import ReplayError, RowSpec
 from replay.table import PriorityError
 from replay.wire import (
@@ -110,12 +110,12 @@ class ReplayServer:
             "sync": (self._keys.sync, self._on_sync),
         }
         queryables = [
-            self._session.declare_queryable(key, self._enqueue(name))
+            self._session.declare_queryable(key, direct(self._enqueue(name)))
             for name, (key, _) in handlers.items()
         ]
         if self._hub is not None:
             queryables += [
-                self._hub.declare_queryable(key, self._enqueue(name))
+                self._hub.declare_queryable(key, direct(self._enqueue(name)))
                 for name, (key, _) in handlers.items()
                 if name in _QUESTIONS
             ]

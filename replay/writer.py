@@ -30,6 +30,7 @@ import numpy as np
 import zenoh
 
 from replay.keys import RunKeys
+from replay.session import direct
 from replay.spec import ReplayError, RowSpec
 from replay.wire import Insert, InsertReply, Status, WireError
 
@@ -226,7 +227,7 @@ class Writer:
         )
         self._session.get(
             self._key,
-            zenoh.handlers.Callback(on_reply, on_end),
+            direct(on_reply, on_end),
             payload=message.encode(self._spec),
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=zenoh.CongestionControl.BLOCK,
