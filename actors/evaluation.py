@@ -9,7 +9,7 @@ from the first step that they decided. Wrong-way and off-route count from
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, final
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +34,7 @@ from sim.world import row_of
 
 MANY = 8  # controlled objects of a scene from which on fewer scenes are driven at once
 Slots = TypeVar("Slots")
+Family = Callable[[Float[Array, " parameters"]], Agent]  # an agent for each vector
 
 
 class Trace(NamedTuple):
@@ -93,6 +94,93 @@ class Evaluation:
         return self.figures["kinematic_infeasibility"].value
 
 
+@final
+class Judge:
+    """Drives the scenes of a bank and judges them, by one compiled program.
+
+    The agent's parameters are an argument of the program: all checkpoints of a run
+    are driven by the same one.
+    """
+
+    def __init__(
+        self,
+        file: BankFile,
+        family: Family,
+        *,
+        config: EnvironmentConfig,
+        controlled: ControlledSet | None = None,
+        from_first_step: bool = False,
+    ) -> None:
+        """Compiles when it first drives.
+
+        Args:
+            file: the scenes.
+            family: the agent of each parameter vector; it decides for all controlled
+                objects of a scene.
+            config: dynamics, observation and reward.
+            controlled: whom the agent decides for and who of them is judged; by
+                default each scene's SDC.
+            from_first_step: start at step 0 and judge it too (playback).
+        """
+        self._file = file
+        self._chosen = controlled or sdc_of(file)
+        self._rollout = _rollout(family, config, self._chosen.judged, from_first_step)
+
+    @property
+    def compilations(self) -> int:
+        """Programs compiled so far: one for each number of scenes driven at once."""
+        return int(self._rollout._cache_size())  # type: ignore[attr-defined]
+
+    def evaluate(
+        self,
+        parameters: Float[Array | np.ndarray, " parameters"],
+        *,
+        name: str,
+        key: PRNGKeyArray,
+        keep_trace: bool = False,
+        most: int | None = None,
+    ) -> Evaluation:
+        """Drives every scene by one member of the family and judges it.
+
+        Args:
+            parameters: which member.
+            name: its name, for the results.
+            key: for agents that draw.
+            keep_trace: keep the states for a recording.
+            most: the first so many scenes; None is all.
+        """
+        file = self._file
+        driven = min(file.scenes, most or file.scenes)
+        few = 64 if self._chosen.slots.shape[1] < MANY else 8
+        chunk = min(few, driven)
+        # A copy of its own: `device_put` may alias a buffer that is used again.
+        vector = jnp.array(np.array(parameters, np.float32, copy=True))
+        results: list[SceneResult] = []
+        traces: list[Trace] = []
+        for first in range(0, driven, chunk):
+            # The last chunk repeats its last scene: one shape, one compilation.
+            scenes = np.minimum(np.arange(first, first + chunk), driven - 1)
+            keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(scenes)
+            slots = jnp.asarray(self._chosen.slots[scenes])
+            trace = jax.device_get(
+                self._rollout(keys, file.bank, jnp.asarray(scenes), slots, vector)
+            )
+            kept = min(chunk, driven - first)
+            trace = jax.tree.map(lambda values, kept=kept: values[:kept], trace)
+            results += [
+                _result(file.scenario_ids[first + row], trace, row)
+                for row in range(kept)
+            ]
+            if keep_trace:
+                traces.append(trace)
+        joined = (
+            jax.tree.map(lambda *parts: np.concatenate(parts), *traces)
+            if traces
+            else None
+        )
+        return Evaluation(agent=name, scenes=results, trace=joined)
+
+
 def evaluate(
     file: BankFile,
     agent: Agent,
@@ -104,47 +192,20 @@ def evaluate(
     from_first_step: bool = False,
     keep_trace: bool = False,
 ) -> Evaluation:
-    """Drives every scene of the bank and judges it.
-
-    Args:
-        file: the scenes.
-        agent: decides for all controlled objects of a scene.
-        name: the agent's, for the results.
-        key: for agents that draw.
-        config: dynamics, observation and reward.
-        controlled: whom the agent decides for and who of them is judged; by default
-            each scene's SDC.
-        from_first_step: start at step 0 and judge it too (playback).
-        keep_trace: keep the states for a recording.
-    """
-    bank = file.bank
-    chosen = controlled or sdc_of(file)
-    few = 64 if chosen.slots.shape[1] < MANY else 8
-    chunk = min(few, file.scenes)
-    rollout = _rollout(agent, config, chosen.judged, from_first_step)
-    results: list[SceneResult] = []
-    traces: list[Trace] = []
-    for first in range(0, file.scenes, chunk):
-        # The last chunk repeats its last scene: one shape, one compilation.
-        scenes = np.minimum(np.arange(first, first + chunk), file.scenes - 1)
-        keys = jax.vmap(lambda index: jax.random.fold_in(key, index))(scenes)
-        slots = jnp.asarray(chosen.slots[scenes])
-        trace = jax.device_get(rollout(keys, bank, jnp.asarray(scenes), slots))
-        kept = min(chunk, file.scenes - first)
-        trace = jax.tree.map(lambda values, kept=kept: values[:kept], trace)
-        results += [
-            _result(file.scenario_ids[first + row], trace, row) for row in range(kept)
-        ]
-        if keep_trace:
-            traces.append(trace)
-    joined = (
-        jax.tree.map(lambda *parts: np.concatenate(parts), *traces) if traces else None
+    """Drives every scene of the bank by an agent without parameters; see `Judge`."""
+    judge = Judge(
+        file,
+        lambda _: agent,
+        config=config,
+        controlled=controlled,
+        from_first_step=from_first_step,
     )
-    return Evaluation(agent=name, scenes=results, trace=joined)
+    nothing = jnp.zeros(0, jnp.float32)
+    return judge.evaluate(nothing, name=name, key=key, keep_trace=keep_trace)
 
 
 def _rollout(
-    agent: Agent, config: EnvironmentConfig, judged: int, from_first_step: bool
+    family: Family, config: EnvironmentConfig, judged: int, from_first_step: bool
 ) -> Callable[..., Trace]:
     """The compiled rollout of a batch of scenes; axes of its trace: scenes, steps.
 
@@ -156,7 +217,9 @@ def _rollout(
         bank: Bank,
         scene: Int[Array, ""],
         controlled: Int[Array, " controlled"],
+        parameters: Float[Array, " parameters"],
     ) -> Trace:
+        agent = family(parameters)
         first = jnp.int32(0) if from_first_step else bank.current_step[scene]
         state = start_at(bank, scene, first, controlled, config)
 
@@ -173,7 +236,7 @@ def _rollout(
             )
         return trace
 
-    return jax.jit(jax.vmap(one, in_axes=(0, None, 0, 0)))
+    return jax.jit(jax.vmap(one, in_axes=(0, None, 0, 0, None)))
 
 
 def _step(

@@ -18,7 +18,7 @@ import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import msgspec
 
@@ -89,6 +89,26 @@ class ReportConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class EvaluatorConfig:
+    """The evaluation beside the training: `launch.evaluator`."""
+
+    scenes: int = 64
+    """Held-out scenes that each checkpoint drives, the first ones; 0: no evaluator."""
+    seconds: float = 60.0
+    """From the beginning of an evaluation to the next one's, at least."""
+    updates: int = 0
+    """Updates from an evaluated checkpoint to the next one, at least."""
+
+    def __post_init__(self) -> None:
+        """Refuses negative numbers."""
+        for name in ("scenes", "seconds", "updates"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(
+                    f"evaluator: {name}={getattr(self, name)} must not be negative"
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
 class ExperimentConfig:
     """Everything that a run depends on."""
 
@@ -110,6 +130,8 @@ class ExperimentConfig:
     """Procedural scenes, and how recorded ones are split."""
     report: ReportConfig = field(default_factory=ReportConfig)
     """Checkpoints, curves, recording."""
+    evaluator: EvaluatorConfig = field(default_factory=EvaluatorConfig)
+    """Which checkpoints are driven on held-out scenes while the run goes on."""
     actors: int = 2
     """Actor processes."""
     seed: int = 0
@@ -211,7 +233,14 @@ class RunFile:
     train_hash: str  # of the bank's content, SHA-256
     held_out_hash: str
     scenes: tuple[str, ...]  # as given on the command line
+    algorithm: Literal["dqn", "bc"] = "dqn"
+    objects: Literal["sdc", "vehicles"] = "vehicles"  # whose actions are cloned
     format: int = FORMAT
+
+    @property
+    def mixture(self) -> int:
+        """Components of the policy's mixture; 0: an output for each of the actions."""
+        return self.config.cloning.mixture if self.algorithm == "bc" else 0
 
     def write(self, folder: Path) -> None:
         """Writes the run folder's file; whole or not at all."""

@@ -76,6 +76,8 @@ def snapshot(
     for name in ("loss", "mean_q", "updates_per_s", "waited_share"):
         if name in learner:
             figures[name if name != "waited_share" else "learner_waits"] = learner[name]
+    # An evaluation takes longer than others are silent: its last figures stand.
+    figures |= roles.get("evaluator", (0.0, {}))[1]
     waits = [
         float(values["waited_s"]) / max(float(values["uptime_s"]), 1e-9)
         for values in actors
@@ -126,8 +128,26 @@ def _cells(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("return", number("return", ".2f")),
         ("failure rate", percent("failure_rate")),
         ("progress", percent("progress")),
+        ("held out", held_out(figures)),
         ("left", "-" if left is None else f"{left // 60:.0f}:{left % 60:02.0f}"),
     ]
+
+
+def held_out(figures: Mapping[str, Any]) -> str:
+    """How the checkpoint judged last drove, and the best so far."""
+    if "evaluated_updates" not in figures:
+        return "-"
+    parts = [
+        f"failures {figures['held_out_failure_rate']:.1%}",
+        f"log ADE {figures['held_out_log_displacement']:.2f} m",
+    ]
+    if "held_out_log_likelihood" in figures:
+        parts.append(f"log p {figures['held_out_log_likelihood']:.3f}")
+    parts.append(f"at {figures['evaluated_updates']:,}")
+    if "best_updates" in figures:
+        best = f"{figures['best_failure_rate']:.1%} at {figures['best_updates']:,}"
+        parts.append(f"(best {best})")
+    return " ".join(parts)
 
 
 def line_of(figures: Mapping[str, Any]) -> str:

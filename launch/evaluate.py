@@ -23,16 +23,18 @@ from actors.controlled import (
     tracks_of,
     with_others,
 )
-from actors.evaluation import Evaluation, evaluate
+from actors.evaluation import Evaluation, Judge, evaluate
 from actors.frames import FrameBatch
-from actors.policy import greedy, policy_agent, random_vector, read_policy
-from launch.config import ExperimentConfig, ScenesConfig, write_atomically
+from actors.policy import Policy, find_policy, greedy, random_vector, read_policy
+from launch.config import ExperimentConfig, RunFile, ScenesConfig, write_atomically
 from launch.drivers import PLAYBACK, Driver, built_in, check_step, driver_of
 from launch.errors import LaunchError
+from launch.failures import failures_json, failures_of, others_json, plot_intervals
 from launch.scenes import bank_of
 from launch.tables import markdown_of, printer, scenes_json, summary, table_of, title_of
 from sim.agents import Agent, composite
 from sim.bank import BankFile
+from sim.dynamics import ActionConfig
 from sim.idm import idm
 
 COMPARED: Final = ("random", "constant-speed", "idm", "expert")
@@ -56,7 +58,14 @@ class EvaluateConfig:
     json: str = ""
     """Writes the results of every scene to this file, or to standard output by -."""
     markdown: str = ""
-    """Writes the table to this file."""
+    """Writes the table, and which scenes fail, to this file."""
+    plot: str = ""
+    """Draws the figures with their intervals into this file (PNG, SVG or PDF)."""
+    record: str = ""
+    """Records rollouts of the one agent for the viewer in this file (.rrd), failed ones
+    and others in turns."""
+    rollouts: int = 12
+    """How many."""
     count: int = 64
     """Scenes of `procedural`."""
     seed: int = 0
@@ -83,6 +92,11 @@ def evaluate_command(options: EvaluateConfig) -> int:
     if not options.agent or len(set(options.agent)) < len(options.agent):
         raise LaunchError("--agent: name agents, runs or checkpoints, each once")
     rows = rows_named(options.objects)
+    if options.record and (len(options.agent) > 1 or options.objects != "sdc"):
+        raise LaunchError(
+            "--record shows the recording vehicle by one agent: name one --agent, and "
+            "leave --objects at sdc"
+        )
     drivers = [driver_of(name) for name in options.agent]
     config = ScenesConfig(held_out=options.count, seed=options.seed)
     with ExitStack() as keep:
@@ -91,6 +105,13 @@ def evaluate_command(options: EvaluateConfig) -> int:
         for driver in drivers:
             check_step(bank, driver.environment)
         results = [_evaluated(driver, bank, chosen, options) for driver in drivers]
+        if options.record:
+            path, action = Path(options.record), drivers[0].environment.action
+            if not record(path, action, bank, results[0], most=options.rollouts):
+                raise LaunchError(
+                    "--record needs the viewer's packages: pip install "
+                    "'slipstream[viewer]'"
+                )
     _write(results, options)
     return 0
 
@@ -113,6 +134,7 @@ def _evaluated(
         config=driver.environment,
         controlled=slots,
         from_first_step=driver.name == PLAYBACK,
+        keep_trace=bool(options.record),
     )
 
 
@@ -120,12 +142,18 @@ def _write(results: list[Evaluation], options: EvaluateConfig) -> None:
     """JSON and markdown where asked for, and the table."""
     content: dict[str, Any] = _report_json(results)
     if len(results) == 1:
-        content = {**summary(results[0]), "scenes": scenes_json(results[0])}
+        content = {
+            **summary(results[0]),
+            "failures": failures_json(results)[results[0].agent],
+            "scenes": scenes_json(results[0]),
+        }
     text = json.dumps(content, indent=1) + "\n"
     title = title_of(results, ", ".join(options.scenes))
     if options.markdown:
-        markdown = markdown_of(results, title)
+        markdown = markdown_of(results, title) + failures_of(results)
         write_atomically(Path(options.markdown), markdown.encode())
+    if options.plot:
+        _plot(results, Path(options.plot), title)
     if options.json == "-":
         print(text, end="")
         return
@@ -135,42 +163,46 @@ def _write(results: list[Evaluation], options: EvaluateConfig) -> None:
     console.print(table_of(results, title, width=console.width))
 
 
+def _plot(results: list[Evaluation], path: Path, title: str) -> None:
+    """The figures with their intervals, in a format that matplotlib knows."""
+    try:
+        plot_intervals(results, path, title)
+    except ImportError as error:
+        raise LaunchError(
+            "--plot needs matplotlib: pip install 'slipstream[learner]'"
+        ) from error
+    except ValueError as error:  # of an unknown format
+        raise LaunchError(f"--plot {path}: {error}") from error
+
+
 def _report_json(results: list[Evaluation]) -> dict[str, Any]:
     """Several agents: their figures, and every scene's row of each."""
     return {
+        "failures": failures_json(results),
         "agents": [summary(result) for result in results],
         "scenes": {result.agent: scenes_json(result) for result in results},
     }
 
 
 def compare(
-    config: ExperimentConfig, policy_path: Path, bank: BankFile
+    config: ExperimentConfig, policy: Policy, judge: Judge, bank: BankFile
 ) -> list[Evaluation]:
     """The trained agent beside the untrained network and the benchmark's agents."""
     environment = config.environment
-    policy = read_policy(policy_path)
-    policy.check(environment, policy_path)
     key = jax.random.fold_in(jax.random.key(config.seed), 1_000_000)
-    weights_key, key = jax.random.split(key)
+    weights_key, *keys = jax.random.split(key, 3 + len(COMPARED))
+    trained = judge.evaluate(
+        policy.vector, name="trained", key=keys[0], keep_trace=True
+    )
     untrained = random_vector(weights_key, config.network, environment)
     drivers: list[tuple[str, Agent]] = [
-        ("trained", policy_agent(policy, environment)),
         ("untrained", greedy(untrained, config.network, environment)),
         *((name, built_in(name, environment)) for name in COMPARED),
     ]
-    results = []
-    for name, agent in drivers:
-        key, own_key = jax.random.split(key)
-        result = evaluate(
-            bank,
-            agent,
-            name=name,
-            key=own_key,
-            config=environment,
-            keep_trace=name == "trained",
-        )
-        results.append(result)
-    return results
+    return [trained] + [
+        evaluate(bank, agent, name=name, key=own_key, config=environment)
+        for (name, agent), own_key in zip(drivers, keys[1:], strict=True)
+    ]
 
 
 def chosen(
@@ -187,36 +219,40 @@ def chosen(
 
 
 def report(
-    folder: Path, config: ExperimentConfig, bank: BankFile, policy_path: Path
+    folder: Path, run: RunFile, judge: Judge, bank: BankFile
 ) -> list[Evaluation]:
-    """Writes a run's evaluation.json, .md and .rrd, and prints its table."""
-    results = compare(config, policy_path, bank)
+    """Writes a run's evaluation.json, .md and .png, and prints its table."""
+    policy_path = find_policy(folder)
+    policy = read_policy(policy_path)
+    policy.check(run.config.environment, policy_path)
+    results = compare(run.config, policy, judge, bank)
     title = title_of(results, "held out")
-    text = json.dumps(_report_json(results), indent=1) + "\n"
+    content = _report_json(results) | others_json(
+        results[0], run.config.evaluator.scenes
+    )
+    text = json.dumps(content, indent=1) + "\n"
     write_atomically(folder / "evaluation.json", text.encode())
-    markdown = markdown_of(results, title)
+    markdown = markdown_of(results, title) + failures_of(results[:1])
     write_atomically(folder / "evaluation.md", markdown.encode())
+    plot_intervals(results, folder / "evaluation.png", title)
     console = printer()
     console.print(table_of(results, title, width=console.width))
     return results
 
 
 def record(
-    folder: Path, config: ExperimentConfig, bank: BankFile, trained: Evaluation
-) -> Path | None:
-    """Writes the recording of the trained agent; None where Rerun is not installed."""
+    path: Path, action: ActionConfig, bank: BankFile, driven: Evaluation, *, most: int
+) -> bool:
+    """Writes the recording of an agent; False where Rerun is not installed."""
     try:
         from launch.bank_view import bank_scenes, labels_of
         from launch.recording import record_evaluation, rollouts_of
     except ImportError:
-        return None
-    path = folder / "evaluation.rrd"
+        return False
     record_evaluation(
         path,
         scene_of=bank_scenes(bank),
-        rollouts=chosen(
-            trained, rollouts_of(trained, bank), most=config.report.rollouts
-        ),
-        actions=labels_of(config.environment.action),
+        rollouts=chosen(driven, rollouts_of(driven, bank), most=most),
+        actions=labels_of(action),
     )
-    return path
+    return True

@@ -52,6 +52,7 @@ def run_role(name: str, parse: Parse) -> int:
         "replay": _replay,
         "actor": _actor,
         "learner": _learner,
+        "evaluator": _evaluator,
         "viewer": _viewer,
     }
     act = roles[name](parse)
@@ -80,6 +81,13 @@ def _learner(parse: Parse) -> Act:
     from launch.learning import learner_role
 
     return lambda stop: learner_role(options, stop)
+
+
+def _evaluator(parse: Parse) -> Act:
+    options = parse(JoinConfig)
+    from launch.evaluator import evaluator_role
+
+    return lambda stop: evaluator_role(options, stop)
 
 
 def _viewer(parse: Parse) -> Act:

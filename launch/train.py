@@ -3,7 +3,8 @@
     RUN/config.json          the resolved configuration      scenes/*.bank
         logs/ROLE.log        what each process printed       curves.csv, .png
         tensorboard/         the same curves                 checkpoints/
-        evaluation.json .md .rrd   scores and a recording    status.json
+        evaluation.csv       how checkpoints drove           best/  of them
+        evaluation.json .md .png .rrd   scores and a recording    status.json
 
 One replay service (critical unless it is durable), a learner that ends the run and is
 started again from its newest checkpoint, and actors that are started again are
@@ -231,6 +232,8 @@ def roles_of(folder: Path, run: RunFile, port: int, placement: Placement) -> lis
                 command=(*command, "actor", *client, "--actor", str(actor)),
             )
         )
+    if run.config.evaluator.scenes:
+        roles.append(Role(name="evaluator", command=(*command, "evaluator", *client)))
     if placement.view:
         roles.append(Role(name="viewer", command=(*command, "viewer", *client)))
     return roles
@@ -336,14 +339,19 @@ def train_command(options: TrainConfig) -> int:
 
 def finish(folder: Path, run: RunFile) -> None:
     """Draws the curves, scores the agent on the held-out scenes and records it."""
-    from actors.policy import find_policy
     from launch.evaluate import record, report
+    from launch.evaluator import CURVE, CheckpointJudge
     from learner.curves import plot_curves
 
-    plot_curves(folder / "curves.csv", folder / "curves.png", title=str(folder))
-    bank = open_bank(folder / SCENES / HELD_OUT)
-    results = report(folder, run.config, bank, find_policy(folder))
-    recording = record(folder, run.config, bank, results[0])
+    judge = CheckpointJudge(folder, run)
+    if run.config.evaluator.scenes:
+        judge.look()  # the last checkpoint, which the evaluator may not have come to
+    judge.close()
+    curves = [folder / "curves.csv", folder / CURVE]
+    plot_curves(curves, folder / "curves.png", title=str(folder))
+    results = report(folder, run, judge.judge, judge.bank)
     print(f"curves: {folder / 'curves.png'}")
-    if recording is not None:
+    recording, most = folder / "evaluation.rrd", run.config.report.rollouts
+    action = run.config.environment.action
+    if record(recording, action, judge.bank, results[0], most=most):
         print(f"recording: {recording}  (slipstream view {folder})")

@@ -115,24 +115,26 @@ def read_curves(path: Path) -> dict[str, Float[np.ndarray, " rows"]]:
     return {name: table[:, index] for index, name in enumerate(header)}
 
 
-def plot_curves(csv_path: Path, png_path: Path, *, title: str = "") -> None:
-    """Draws every column that has values over the number of updates."""
+def plot_curves(
+    csv_paths: Path | Sequence[Path], png_path: Path, *, title: str = ""
+) -> None:
+    """Draws every column that has values over the number of updates.
+
+    A first file's columns go by their names, those of further ones by the file's, too.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    curves = read_curves(csv_path)
-    steps = curves.pop(STEP, None)
-    if steps is None:
-        raise CurvesError(f"{csv_path}: has no column {STEP}")
-    drawn = {
-        name: values for name, values in curves.items() if np.isfinite(values).any()
-    }
+    first, *others = [csv_paths] if isinstance(csv_paths, Path) else csv_paths
+    drawn = _drawn(first, "")
+    for other in others:
+        drawn |= _drawn(other, f"{other.stem}: ")
     across = 3
     down = max(1, -(-len(drawn) // across))
     # Figure and canvas by hand: pyplot keeps global state and looks for a display.
     figure = Figure(figsize=(4.0 * across, 2.6 * down), layout="constrained")
     FigureCanvasAgg(figure)
-    for index, (name, values) in enumerate(drawn.items()):
+    for index, (name, (steps, values)) in enumerate(drawn.items()):
         axes = figure.add_subplot(down, across, index + 1)
         known = np.isfinite(values)
         marker = "." if known.sum() < 20 else ""
@@ -145,6 +147,21 @@ def plot_curves(csv_path: Path, png_path: Path, *, title: str = "") -> None:
         figure.suptitle(title, fontsize=10)
     png_path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(png_path, dpi=120)
+
+
+def _drawn(
+    path: Path, prefix: str
+) -> dict[str, tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]]:
+    """Steps and values of a file's columns that have any."""
+    curves = read_curves(path)
+    steps = curves.pop(STEP, None)
+    if steps is None:
+        raise CurvesError(f"{path}: has no column {STEP}")
+    return {
+        f"{prefix}{name}": (steps, values)
+        for name, values in curves.items()
+        if np.isfinite(values).any()
+    }
 
 
 def _cell(value: float | None) -> str:

@@ -194,7 +194,7 @@ def test_ctrl_c_stops_a_run_and_it_can_be_resumed(tmp_path: Path) -> None:
         lambda: latest.exists() and int(latest.read_text()) > 0, "a checkpoint", process
     )
     children = process.children(recursive=True)
-    assert len(children) == 5  # replay, learner, two actors, the reaper
+    assert len(children) == 6  # replay, learner, two actors, evaluator, the reaper
     process.send_signal(signal.SIGINT)
     assert process.wait(PATIENCE_S) == 130
     assert not psutil.wait_procs(children, timeout=20)[1]
