@@ -143,13 +143,17 @@ class InsertDesk:
             held.query = None
 
     def _acknowledge(self, held: HeldInsert, status: Status, reason: str = "") -> None:
-        """Answers with the writer's next sequence."""
+        """Answers with the writer's next sequence.
+
+        A stale one is told the epoch in force, which its writer may have to exceed.
+        """
         if held.query is None:
             return
+        told = held.state if status is Status.STALE else held.message
         reply = InsertReply(
             status=status,
             writer=held.message.writer,
-            epoch=held.message.epoch,
+            epoch=told.epoch,
             next_sequence=held.state.next_sequence,
             incarnation=self._incarnation,
             reason=reason,

@@ -4,7 +4,9 @@ A batch carries (writer, epoch, sequence). The service accepts a writer's batche
 order only, so a lost one is answered by a gap and everything from it on is sent again
 (go-back-N): cheap, because the window is about four batches. `epoch` must grow from
 one life of the writer's process to the next; then nothing that a killed process left
-in the network can be taken for the new one's.
+in the network can be taken for the new one's. Epochs come from a clock, and a clock
+can be set back: a writer whose very first batch is told that a later epoch has been
+goes on above that one, as nothing of it can be stored yet.
 
 A batch also carries `base`, the lowest sequence that is not acknowledged. A service
 that has lost its memory takes up the writer there: batches below it were acknowledged
@@ -16,6 +18,7 @@ What the writer does with an answer:
     BUSY      the limiter held it as long as allowed: send again at once
     GAP       send again from the first unacknowledged batch
     no answer (killed, unreachable, access denied, timed out): the same, with back-off
+    STALE     to the first sending of the first batch: continue above that epoch
     STALE, REFUSED   raise in the caller's thread
 """
 
@@ -205,12 +208,13 @@ class Writer:
     def _send(self, batch: _Batch, base: int, generation: int) -> None:
         """One query; its end without an answer is a failure."""
         answered = False
+        first = batch.sequence == 0 and generation == 0
 
         def on_reply(reply: zenoh.Reply) -> None:
             nonlocal answered
             if reply.ok is not None:
                 answered = True
-                self._on_answer(reply.ok.payload.to_bytes(), generation)
+                self._on_answer(reply.ok.payload.to_bytes(), generation, first)
 
         def on_end() -> None:
             if not answered:
@@ -234,8 +238,11 @@ class Writer:
             timeout=self._hold_s + _ANSWER_MARGIN_S,
         )
 
-    def _on_answer(self, payload: bytes, generation: int) -> None:
-        """Forgets what is stored; goes back if something is missing."""
+    def _on_answer(self, payload: bytes, generation: int, first: bool) -> None:
+        """Forgets what is stored; goes back if something is missing.
+
+        `first`: it answers the first batch, which had been sent once.
+        """
         with self._changed:
             try:
                 reply = InsertReply.decode(payload, self._spec)
@@ -243,7 +250,9 @@ class Writer:
                 self._error = error
                 self._changed.notify_all()
                 return
-            if reply.status in (Status.STALE, Status.REFUSED):
+            if reply.status is Status.STALE and self._rises(reply.epoch, first):
+                pass
+            elif reply.status in (Status.STALE, Status.REFUSED):
                 self._error = ReplayError(f"replay refused the rows: {reply.reason}")
             elif reply.next_sequence > self._next_sequence:
                 self._error = ReplayError(
@@ -258,6 +267,14 @@ class Writer:
                     pause = _GAP_PAUSE_S if reply.status is Status.GAP else 0.0
                     self._go_back(pause)
             self._changed.notify_all()
+
+    def _rises(self, in_force: int, first: bool) -> bool:
+        """Whether the writer goes on above the epoch that made a batch stale."""
+        if first and in_force > self._epoch:
+            self._epoch = in_force + 1
+            self._go_back(0.0)
+        # Below: it answers what was sent before the epoch was raised.
+        return in_force < self._epoch
 
     def _on_failure(self, generation: int) -> None:
         with self._changed:

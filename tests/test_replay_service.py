@@ -243,12 +243,25 @@ def test_the_service_checks_priorities_itself() -> None:
 def test_a_replaced_writer_is_told_so() -> None:
     with service(OPEN) as running:
         old, new = make_writer(running.client), make_writer(running.client, epoch=2)
-        new.append(make_rows(0, 4))
-        assert new.flush(10.0)
-        old.append(make_rows(0, 4))
+        for writer in (old, new):
+            writer.append(make_rows(0, 4))
+            assert writer.flush(10.0)
+        old.append(make_rows(4, 4))
         with pytest.raises(ReplayError, match="replaced by a process of epoch 2"):
             old.flush(10.0)
         new.close()
+
+
+def test_a_writer_started_after_its_clock_was_set_back_goes_on() -> None:
+    """Epochs are clock readings: a later life may begin with an earlier one."""
+    with service(OPEN) as running:
+        for epoch, first in ((9, 0), (3, 4), (3, 8)):
+            writer = make_writer(running.client, epoch=epoch)
+            writer.append(make_rows(first, 4))
+            assert writer.close(10.0)
+            assert writer.acknowledged == 4
+        assert stored_numbers(running.client) == list(range(12))
+        assert fetch_stats(running.client, KEYS)["writers"][0]["epoch"] == 11
 
 
 def test_nobody_there_is_told_in_one_line() -> None:
