@@ -3,10 +3,21 @@
 Each step observes, evaluates the network's twin once for the whole batch, draws the
 epsilon-greedy action, steps, and starts the environments whose episode is over anew.
 The transition keeps the state before that restart.
+
+An environment controls up to S objects of its scene, all by the one policy, each with
+an episode of its own within the environment's. A transition of an object is there
+(`present`) where it was recorded before and after the step, and its episode is over
+(`over`)
+
+- with a failure that terminates: the object drives on among the others, but nothing
+  of it is learnt until its environment starts anew;
+- where its recording ends, for now or for good: truncated;
+- with its environment, which starts anew when the recording is at its end or no object
+  is left that is recorded and has not failed.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,14 +27,25 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from actors.network import NetworkConfig, batched
 from sim import metrics
 from sim.bank import Bank
-from sim.environment import EnvironmentConfig, State, step
-from sim.episodes import auto_reset, draw, episode_over, sdc_only, starts
-from sim.observation import ObservationSizes, observation_sizes, observe_batch
+from sim.environment import EnvironmentConfig, State, recorded, step
+from sim.episodes import (
+    Choice,
+    NearestToSdc,
+    auto_reset,
+    draw,
+    episode_over,
+    sdc_only,
+    starts,
+)
+from sim.observation import ObservationSizes, observation_sizes, observe_first_batch
+from sim.world import View, row_of
+
+Objects = Literal["sdc", "vehicles", "all"]
 
 
 @dataclass(frozen=True)
 class ActingConfig:
-    """What is compiled into the scan."""
+    """What an actor does."""
 
     environment: EnvironmentConfig
     """Simulation, observation and reward."""
@@ -33,6 +55,12 @@ class ActingConfig:
     """Steps per call (K)."""
     watched: int
     """Environments, the first ones, whose Q-values are handed out."""
+    choose: Choice = sdc_only
+    """The objects that an environment controls."""
+    n_step: int = 1
+    """Steps that a row spans."""
+    discount: float = 1.0
+    """Gamma, by which rows of several steps are summed."""
 
     @property
     def sizes(self) -> ObservationSizes:
@@ -44,28 +72,30 @@ class Running(NamedTuple):
     """M environments between two calls; `score` is the return so far, undiscounted."""
 
     state: State  # batched: every field has the axis `environments` in front
-    score: Float[Array, " environments"]
-    failed: Bool[Array, " environments"]  # an overlap or off-road so far
+    score: Float[Array, "environments slots"]
+    failed: Bool[Array, "environments slots"]  # an overlap or off-road so far
+    ended: Bool[Array, "environments slots"]  # by a failure that terminates
 
 
 class Transitions(NamedTuple):
-    """K steps of M environments; `_tm1` is before the step, `_t` after it."""
+    """K steps of S objects in M environments; from s_tm1 to s_t."""
 
     scene: Int[Array, "steps environments"]
     step: Int[Array, "steps environments"]  # t of s_t
-    controlled: Int[Array, "steps environments"]
-    states: Float[Array, "steps environments states 5"]
-    valid: Bool[Array, "steps environments states"]
-    action: Int[Array, "steps environments"]
-    reward: Float[Array, "steps environments"]
-    discount: Float[Array, "steps environments"]
-    overlap: Bool[Array, "steps environments"]
-    offroad: Bool[Array, "steps environments"]
-    over: Bool[Array, "steps environments"]  # the episode ended with s_t
-    score: Float[Array, "steps environments"]  # return up to s_t
-    failed: Bool[Array, "steps environments"]  # any failure up to s_t
-    progress: Float[Array, "steps environments"]  # of the log's route; NaN: none
-    q_values: Float[Array, "steps watched actions"]  # of the first environments
+    controlled: Int[Array, "steps environments slots"]
+    states: Float[Array, "steps environments slots states 5"]
+    valid: Bool[Array, "steps environments slots states"]
+    action: Int[Array, "steps environments slots"]
+    reward: Float[Array, "steps environments slots"]
+    discount: Float[Array, "steps environments slots"]
+    overlap: Bool[Array, "steps environments slots"]
+    offroad: Bool[Array, "steps environments slots"]
+    present: Bool[Array, "steps environments slots"]  # False: no transition
+    over: Bool[Array, "steps environments slots"]  # its episode ended with s_t
+    score: Float[Array, "steps environments slots"]  # return up to s_t
+    failed: Bool[Array, "steps environments slots"]  # any failure up to s_t
+    progress: Float[Array, "steps environments slots"]  # of the log's route; NaN: none
+    q_values: Float[Array, "steps watched actions"]  # of their first objects
 
 
 def epsilons(
@@ -79,14 +109,32 @@ def epsilons(
     return every[actor::actors].astype(np.float32)
 
 
+def choice_of(objects: Objects, slots: int) -> Choice:
+    """The recording vehicle, or it and the nearest vehicles that move, or all."""
+    if objects == "sdc":
+        return sdc_only
+    vehicles = objects == "vehicles"
+    return NearestToSdc(slots, moving=vehicles, vehicles=vehicles)
+
+
+def own_first(slots: int) -> Int[np.ndarray, "slots slots"]:
+    """For each slot the order in which it comes first and the others keep theirs."""
+    return np.array(
+        [[own, *(slot for slot in range(slots) if slot != own)] for own in range(slots)]
+    )
+
+
 def start(
-    key: PRNGKeyArray, bank: Bank, environments: int, config: EnvironmentConfig
+    key: PRNGKeyArray, bank: Bank, environments: int, config: ActingConfig
 ) -> Running:
     """M random scenes from their starts."""
+    begin = starts(bank, config.choose, config.environment)
+    state = draw(key, begin, environments)
     return Running(
-        state=draw(key, starts(bank, sdc_only, config), environments),
-        score=jnp.zeros(environments),
-        failed=jnp.zeros(environments, bool),
+        state=state,
+        score=jnp.zeros(state.controlled.shape),
+        failed=jnp.zeros(state.controlled.shape, bool),
+        ended=jnp.zeros(state.controlled.shape, bool),
     )
 
 
@@ -100,7 +148,7 @@ def act(
 ) -> tuple[Running, Transitions]:
     """K steps of all environments. Compile with `config` static."""
 
-    begin = starts(bank, sdc_only, config.environment)
+    begin = starts(bank, config.choose, config.environment)
 
     def one(carry: Running, step_key: PRNGKeyArray) -> tuple[Running, Transitions]:
         return _step(step_key, bank, begin, vector, carry, epsilon, config)
@@ -119,47 +167,84 @@ def _step(
 ) -> tuple[Running, Transitions]:
     state, environment = running.state, config.environment
     explore_key, random_key, reset_key = jax.random.split(key, 3)
-    observation = observe_batch(bank, state.view, environment.observation)
-    observation = jax.tree.map(lambda values: values[:, 0], observation)
-    actions = environment.action.count
-    q_values = batched(
-        vector, observation, config=config.network, sizes=config.sizes, actions=actions
-    )
+    q_values = _q_values(bank, vector, state, config)
     greedy = jnp.argmax(q_values, -1).astype(jnp.int32)
+    actions = environment.action.count
     drawn = jax.random.randint(random_key, greedy.shape, 0, actions, jnp.int32)
-    explore = jax.random.uniform(explore_key, greedy.shape) < epsilon
+    explore = jax.random.uniform(explore_key, greedy.shape) < epsilon[:, None]
     action = jnp.where(explore, drawn, greedy)
     state_t, outcome = jax.vmap(step, in_axes=(None, 0, 0, None))(
-        bank, state, action[:, None], environment
+        bank, state, action, environment
     )
-    score = running.score + outcome.reward[:, 0]
-    failed = running.failed | outcome.overlap[:, 0] | outcome.offroad[:, 0]
-    over = episode_over(outcome)
-    progress = jax.vmap(metrics.progress, in_axes=(None, 0, 0, 0))(
-        bank, state_t.scene, state_t.controlled[:, 0], state_t.along[:, 0]
+    present = state.history_valid[..., -1] & outcome.valid & ~running.ended
+    score = running.score + jnp.where(present, outcome.reward, 0.0)
+    failed = running.failed | (present & (outcome.overlap | outcome.offroad))
+    ended = running.ended | (present & outcome.terminated)
+    outcome = outcome._replace(terminated=ended)
+    starts_anew = episode_over(outcome)[:, None]
+    following = jnp.minimum(state_t.step + 1, bank.log.shape[1] - 1)
+    goes_on = jax.vmap(recorded, in_axes=(None, 0, 0, 0))(
+        bank, state_t.scene, following, state_t.controlled
     )
+    over = present & (ended | starts_anew | ~goes_on)
     transitions = Transitions(
         scene=state.scene,
         step=state_t.step,
-        controlled=state.controlled[:, 0],
-        states=jnp.concatenate([state.history[:, 0], state_t.history[:, 0, -1:]], 1),
+        controlled=state.controlled,
+        states=jnp.concatenate([state.history, state_t.history[:, :, -1:]], 2),
         valid=jnp.concatenate(
-            [state.history_valid[:, 0], state_t.history_valid[:, 0, -1:]], 1
+            [state.history_valid, state_t.history_valid[:, :, -1:]], 2
         ),
         action=action,
-        reward=outcome.reward[:, 0],
-        discount=1.0 - outcome.terminated[:, 0].astype(jnp.float32),
-        overlap=outcome.overlap[:, 0],
-        offroad=outcome.offroad[:, 0],
+        reward=outcome.reward,
+        discount=1.0 - ended.astype(jnp.float32),
+        overlap=outcome.overlap,
+        offroad=outcome.offroad,
+        present=present,
         over=over,
         score=score,
         failed=failed,
-        progress=progress,
-        q_values=q_values[: config.watched],
+        progress=_progress(bank, state_t),
+        q_values=q_values[: config.watched, 0],
     )
     after = Running(
         state=auto_reset(reset_key, begin, state_t, outcome),
-        score=jnp.where(over, 0.0, score),
-        failed=failed & ~over,
+        score=jnp.where(over | starts_anew, 0.0, score),
+        failed=failed & ~(over | starts_anew),
+        ended=ended & ~starts_anew,
     )
     return after, transitions
+
+
+def _q_values(
+    bank: Bank, vector: Float[Array, " parameters"], state: State, config: ActingConfig
+) -> Float[Array, "environments slots actions"]:
+    """Of all slots; every object is observed on its own, as rows are rendered."""
+    environments, slots = state.controlled.shape
+    order = own_first(slots)
+
+    def each(values: Array) -> Array:
+        return values[:, order].reshape(-1, *values.shape[1:])
+
+    view = View(
+        scene=jnp.repeat(state.scene, slots),
+        step=jnp.repeat(state.step, slots),
+        controlled=each(state.controlled),
+        history=each(state.history),
+        history_valid=each(state.history_valid),
+    )
+    values = batched(
+        vector,
+        observe_first_batch(bank, view, config.environment.observation),
+        config=config.network,
+        sizes=config.sizes,
+        actions=config.environment.action.count,
+    )
+    return values.reshape(environments, slots, -1)
+
+
+def _progress(bank: Bank, state: State) -> Float[Array, "environments slots"]:
+    of_scene = jax.vmap(metrics.progress, in_axes=(None, None, 0, 0))
+    return jax.vmap(of_scene, in_axes=(None, 0, 0, 0))(
+        bank, state.scene, row_of(bank, state.controlled), state.along
+    )

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from actors import acting
-from actors.acting import ActingConfig, Transitions
+from actors.acting import ActingConfig, Objects, Transitions
 from actors.frames import FrameBatch, make_frames
-from actors.rows import row_spec
+from actors.windows import Windows
 from sim.bank import Bank
 
 
@@ -30,6 +30,12 @@ class ActorConfig:
 
     environments: int = 32
     """Environments stepped at once (M)."""
+    objects: Objects = "sdc"
+    """Whom an environment controls: the recording vehicle, it and other vehicles that
+    move, or all; further ones the nearest first. The paper's is the first."""
+    slots: int = 6
+    """Objects that an environment controls at most; not read where it is the SDC.
+    Every row holds the states of them all: 576 bytes for 6, 768 for 8."""
     scan_steps: int = 8
     """Steps per compiled call, and per batch of rows sent (K)."""
     epsilon_lowest: float = 0.01
@@ -43,7 +49,7 @@ class ActorConfig:
 
     def __post_init__(self) -> None:
         """Refuses what makes no environment or no exploration schedule."""
-        for name in ("environments", "scan_steps", "window"):
+        for name in ("environments", "scan_steps", "window", "slots"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)} must be at least 1")
         if not 0 <= self.watched <= self.environments:
@@ -86,7 +92,7 @@ class Weights(Protocol):
 class Tick(NamedTuple):
     """One scan, as the caller sees it."""
 
-    steps: int  # environment steps taken so far
+    steps: int  # transitions of controlled objects so far
     version: int  # of the weights acted with
     scores: Float[np.ndarray, " ended"]  # returns of the episodes that ended
     failed: np.ndarray  # [ended] bool: an overlap or off-road within it
@@ -115,14 +121,18 @@ def run_actor(
         epsilon: probability of a random action per environment (`acting.epsilons`).
         actor: this actor's number, from 0.
         latest: the newest weights; called between scans.
-        write: takes a batch of rows; blocks while the replay holds back.
+        write: takes a batch of as many rows as a scan has steps of environments;
+            blocks while the replay holds back. Several, one or none after a scan
+            where rows are of n steps or of several objects.
         show: takes the watched environments' frames, where somebody watches.
     """
     start_key, key = jax.random.split(key)
     act = jax.jit(functools.partial(acting.act, config=config))
     running = jax.jit(acting.start, static_argnums=(2, 3))(
-        start_key, bank, len(epsilon), config.environment
+        start_key, bank, len(epsilon), config
     )
+    windows = Windows(n_step=config.n_step, discount=config.discount, actor=actor)
+    batch_rows = len(epsilon) * config.scan_steps
     version, vector = -1, jnp.zeros(0)
     steps = 0
     while True:
@@ -134,9 +144,9 @@ def run_actor(
         running, batch = act(scan_key, bank, vector, running, jnp.asarray(epsilon))
         transitions: Transitions = jax.device_get(batch)
         acted = time.perf_counter()
-        rows = rows_of(transitions, version=version, actor=actor, first=steps)
-        steps += len(rows)
-        write(rows)
+        steps += int(transitions.present.sum())
+        for rows in windows.batches(transitions, version, batch_rows):
+            write(rows)
         if show is not None:
             for environment in range(config.watched):
                 show(frames_of(transitions, environment, actor, steps, version))
@@ -157,36 +167,10 @@ def _on_device(vector: Float[np.ndarray, " n"]) -> Float[Array, " n"]:
     return jnp.array(np.array(vector, np.float32, copy=True))
 
 
-def rows_of(
-    transitions: Transitions, *, version: int, actor: int, first: int
-) -> np.ndarray:
-    """The transitions as rows, step by step; `first` is the first one's serial."""
-    steps, environments = transitions.scene.shape
-    rows = np.zeros(
-        steps * environments, row_spec(transitions.states.shape[2] - 1).dtype
-    )
-    for name in (
-        "scene",
-        "step",
-        "controlled",
-        "states",
-        "valid",
-        "action",
-        "reward",
-        "discount",
-    ):
-        values = np.asarray(getattr(transitions, name))
-        rows[name] = values.reshape(len(rows), *values.shape[2:])
-    rows["weights_version"] = version
-    rows["actor"] = actor
-    rows["serial"] = first + np.arange(len(rows))
-    return rows
-
-
 def frames_of(
     transitions: Transitions, environment: int, actor: int, steps: int, version: int
 ) -> FrameBatch:
-    """What a viewer needs of one watched environment."""
+    """What a viewer needs of one watched environment: its first object."""
     column = jax.tree.map(
         lambda values: np.asarray(values)[:, environment], transitions
     )
@@ -199,13 +183,13 @@ def frames_of(
             len(column.scene),
             scene=column.scene,
             step=column.step,
-            controlled=column.controlled,
-            state=column.states[:, -1],
-            action=column.action,
-            reward=column.reward,
-            progress=np.nan_to_num(column.progress),
-            overlap=column.overlap,
-            offroad=column.offroad,
+            controlled=column.controlled[:, 0],
+            state=column.states[:, 0, -1],
+            action=column.action[:, 0],
+            reward=column.reward[:, 0],
+            progress=np.nan_to_num(column.progress[:, 0]),
+            overlap=column.overlap[:, 0],
+            offroad=column.offroad[:, 0],
         ),
         q_values=column.q_values,
     )

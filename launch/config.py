@@ -29,9 +29,11 @@ from actors.network import (
     paper_network,
     quick_network,
 )
+from actors.rows import row_spec
 from launch.errors import LaunchError
 from learner.config import CloningConfig, LearnerConfig
 from replay.local import ReplayConfig
+from replay.spec import RowSpec
 from sim.dynamics import ActionConfig, ActionSpace
 from sim.environment import EnvironmentConfig
 from sim.observation import ObservationConfig
@@ -324,6 +326,16 @@ def with_durable_replay(config: ExperimentConfig) -> ExperimentConfig:
     """The same run with its replay kept in files."""
     replay = dataclasses.replace(config.replay, durable=True)
     return dataclasses.replace(config, replay=replay)
+
+
+def rows_of_run(config: ExperimentConfig) -> RowSpec:
+    """The layout of the run's transitions."""
+    actor = config.actor
+    return row_spec(
+        config.environment.observation.history,
+        n_step=config.learner.n_step,
+        others=0 if actor.objects == "sdc" else actor.slots - 1,
+    )
 
 
 def largest_batches(config: ExperimentConfig) -> tuple[int, int]:

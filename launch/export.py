@@ -42,7 +42,8 @@ import jax
 import msgspec
 import numpy as np
 
-from actors.rows import Columns, columns_of, render, row_spec
+from actors.rows import Columns, columns_of, render
+from launch.config import rows_of_run
 from launch.errors import LaunchError
 from launch.join import JoinConfig, Joined, joined, train_bank
 from launch.replay_stats import place_of
@@ -177,7 +178,7 @@ def export_command(options: ExportConfig) -> int:
     )
     partial = options.out.with_name(f".{options.out.name}.partial")
     with joined(join, threading.Event()) as place:
-        spec = row_spec(place.run.config.environment.observation.history)
+        spec = rows_of_run(place.run.config)
         pages = fetch_rows(
             session=place.session, keys=place.keys, spec=spec, page_rows=_PAGE
         )

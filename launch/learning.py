@@ -18,8 +18,8 @@ import msgspec
 import numpy as np
 
 from actors.network import layout_hash
-from actors.rows import columns_of, render, row_spec
-from launch.config import ExperimentConfig
+from actors.rows import columns_of, render
+from launch.config import ExperimentConfig, rows_of_run
 from launch.join import JoinConfig, Joined, joined, train_bank
 from launch.status import STATUS_S, actor_rates
 from learner.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
@@ -284,7 +284,7 @@ def learner_role(join: JoinConfig, stop: threading.Event) -> None:
         sampler = Sampler(
             session=place.session,
             keys=place.keys,
-            spec=row_spec(config.environment.observation.history),
+            spec=rows_of_run(config),
             batch_size=config.learner.batch_size,
             batches_per_reply=config.learner.batches_per_reply,
             in_flight=2,

@@ -15,12 +15,17 @@ from typing import TYPE_CHECKING, Final
 import jax
 import numpy as np
 
-from actors.acting import ActingConfig
+from actors.acting import ActingConfig, choice_of
 from actors.actor import Tick, exploration, run_actor
 from actors.frames import FrameBatch, encode_frames
 from actors.network import layout_hash, parameter_layout
-from actors.rows import row_spec
-from launch.config import CONFIG, ExperimentConfig, largest_batches, read_run
+from launch.config import (
+    CONFIG,
+    ExperimentConfig,
+    largest_batches,
+    read_run,
+    rows_of_run,
+)
 from launch.errors import LaunchError
 from launch.join import (
     HELD_OUT,
@@ -83,7 +88,7 @@ def replay_role(
         ReplayServer(
             session=session,
             keys=keys,
-            spec=row_spec(run.config.environment.observation.history),
+            spec=rows_of_run(run.config),
             config=replay,
             seed=run.config.seed,
             folder=join.run / REPLAY / str(keys.shard),
@@ -138,6 +143,9 @@ def acting_config(config: ExperimentConfig) -> ActingConfig:
         network=config.network,
         scan_steps=config.actor.scan_steps,
         watched=config.actor.watched,
+        choose=choice_of(config.actor.objects, config.actor.slots),
+        n_step=config.learner.n_step,
+        discount=config.learner.discount,
     )
 
 
@@ -163,7 +171,7 @@ def _act(place: Joined, actor: int, stop: threading.Event) -> None:
     config = place.run.config
     # In milliseconds: it grows from one start of this actor to the next.
     epoch = time.time_ns() // 1_000_000
-    spec = row_spec(config.environment.observation.history)
+    spec = rows_of_run(config)
     bank = train_bank(place).bank
     subscriber = WeightsSubscriber(session=place.session, keys=place.keys)
     first = _first_weights(subscriber, policy_layout_hash(config), stop)
@@ -182,7 +190,7 @@ def _act(place: Joined, actor: int, stop: threading.Event) -> None:
     status = StatusPublisher(place.session, place.keys, f"actor-{actor}")
 
     def write(rows: np.ndarray) -> None:
-        # One scan is one batch, so what did not fit is whole and offered again.
+        # They are one batch, so what did not fit is whole and offered again.
         while not writer.append(rows, _WAIT_S) and not stop.is_set():
             rows = rows[:0]
 

@@ -8,6 +8,7 @@ only the network between them is left out.
 
 import itertools
 import time
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,8 +17,7 @@ import numpy as np
 
 from actors.actor import Tick, Weights, exploration, run_actor
 from actors.network import layout_hash
-from actors.rows import row_spec
-from launch.config import ExperimentConfig, RunFile
+from launch.config import ExperimentConfig, RunFile, rows_of_run
 from launch.console import Status, line_of, snapshot
 from launch.join import REPLAY, SCENES, TRAIN
 from launch.learning import Progress, Reporter, make_learner, make_render, resume, spent
@@ -34,7 +34,7 @@ _LINE_S = 10.0
 def serial_replay(config: ExperimentConfig, folder: Path | None = None) -> LocalReplay:
     """The run's replay: the one in `folder` if it is durable, else an empty one."""
     return LocalReplay(
-        spec=row_spec(config.environment.observation.history),
+        spec=rows_of_run(config),
         config=config.replay,
         seed=config.seed,
         folder=folder,
@@ -51,8 +51,8 @@ def serial_steps(
     """Updates for ever, actors taking their turns in between."""
     replay = replay or serial_replay(config)
     weights: list[Weights] = []
+    made: deque[np.ndarray] = deque()  # a scan of several objects makes many batches
     layout = layout_hash(learner.layout)
-    turns: list[Iterator[Tick]] = []
 
     def publish(version: int, vector: np.ndarray) -> None:
         weights[:] = [WireWeights(version=version, layout_hash=layout, vector=vector)]
@@ -60,11 +60,13 @@ def serial_steps(
     def sample() -> Sample:
         while not replay.may_sample(config.learner.batch_size):
             # The limiter's check of batch sizes: one of the two sides may go on.
-            status.add(next(next(order)))
+            if made:
+                replay.insert(made.popleft())
+            else:
+                status.add(next(next(order)))
         return replay.sample(config.learner.batch_size)
 
-    turns += _actors(config, bank, replay, weights)
-    order = itertools.cycle(turns)
+    order = itertools.cycle(_actors(config, bank, made, weights))
     steps = learn(
         learner=learner,
         sample=sample,
@@ -78,9 +80,12 @@ def serial_steps(
 
 
 def _actors(
-    config: ExperimentConfig, bank: Bank, replay: LocalReplay, weights: list[Weights]
+    config: ExperimentConfig,
+    bank: Bank,
+    made: deque[np.ndarray],
+    weights: list[Weights],
 ) -> list[Iterator[Tick]]:
-    """The acting loops; a turn of one inserts the rows of a scan."""
+    """The acting loops; a turn of one makes the rows of a scan."""
     key = jax.random.key(config.seed)
     return [
         run_actor(
@@ -90,7 +95,7 @@ def _actors(
             epsilon=exploration(config.actor, actor=actor, actors=config.actors),
             actor=actor,
             latest=lambda: weights[0],
-            write=replay.insert,
+            write=made.append,
         )
         for actor in range(config.actors)
     ]

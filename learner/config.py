@@ -26,8 +26,8 @@ class LearnerConfig:
     """Gamma; multiplies each row's discount, which is 0 at a terminal state."""
 
     n_step: int = 1
-    """Steps whose rewards are summed before the target network's value; rows have to
-    span as many. The paper's is 1."""
+    """Steps whose rewards are summed before the target network's value: the actors make
+    rows of as many. The paper's is 1."""
 
     target_period: int = 100
     """Updates between two copies of the network to the target network."""
@@ -39,7 +39,7 @@ class LearnerConfig:
     """|TD error| at which the loss turns from quadratic to linear."""
 
     reward_clip: float = 1.0
-    """Rewards are clipped to plus or minus this."""
+    """Rewards are clipped to plus or minus this; of n steps, their sum is."""
 
     max_gradient_norm: float = 0.0
     """Gradients are scaled down to this norm over all parameters; 0 means never."""

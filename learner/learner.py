@@ -13,7 +13,10 @@ A policy read off the last weights alone changes from update to update: with
 Juditsky, 1992). Actors take the last weights: what they do wrong is what is to learn.
 
 `discount_t` of a row is the environment's: 1, or 0 if and only if s_t is terminal;
-it is multiplied by the configured discount here. Nothing in an update is random, so
+it is multiplied by the configured discount here. Rows of n steps are made by the
+actors (`actors.windows`), with the return of the n steps and the discount of all but
+the last: nothing here depends on n but that the reward is clipped after the sum, as
+Acme does. Nothing in an update is random, so
 network, target, optimiser and the counter are the whole state.
 """
 
@@ -31,7 +34,7 @@ from actors.network import Layout, NetworkConfig, parameter_layout
 from learner.config import LearnerConfig
 from learner.losses import LossFunction, QBatch, TorchrlLosses, plain_losses
 from learner.network import QNetwork, follow_average, to_torch, to_vector
-from learner.targets import importance_weights, n_step_return, weighted_mean
+from learner.targets import importance_weights, weighted_mean
 from sim.observation import Observation, ObservationSizes
 
 
@@ -40,8 +43,8 @@ class Batch(NamedTuple):
 
     observation_tm1: Observation  # s_tm1, where the action was chosen
     a_tm1: Int[np.ndarray, " batch"]  # index into the action table
-    r_t: Float[np.ndarray, "batch ..."]  # not clipped yet; n steps: of each
-    discount_t: Float[np.ndarray, "batch ..."]  # 1, or 0 iff the state is terminal
+    r_t: Float[np.ndarray, " batch"]  # not clipped yet; n steps: their return
+    discount_t: Float[np.ndarray, " batch"]  # of the row, 0 iff s_t is terminal
     observation_t: Observation  # s_t, or the state n steps after s_tm1
     probabilities: Float[np.ndarray, " batch"]  # with which the replay drew the rows
 
@@ -177,29 +180,15 @@ class Learner:
         with torch.no_grad():
             q_online_t = self.network(*t)
             q_target_t = self.target(*t)
-        r_t, discount_t = self._returns(batch)
+        clip = self.config.reward_clip
         return QBatch(
             q_tm1=q_tm1,
             a_tm1=self._tensor(batch.a_tm1).long(),
-            r_t=r_t,
-            discount_t=discount_t,
+            r_t=self._tensor(batch.r_t).clamp(-clip, clip),
+            discount_t=self._tensor(batch.discount_t) * self.config.discount,
             q_online_t=q_online_t,
             q_target_t=q_target_t,
         )
-
-    def _returns(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Clipped rewards and discounts, of n steps as one."""
-        clip, steps = self.config.reward_clip, self.config.n_step
-        r_t = self._tensor(batch.r_t).clamp(-clip, clip)
-        discount_t = self._tensor(batch.discount_t) * self.config.discount
-        if steps == 1:
-            return r_t, discount_t
-        if r_t.shape[1:] != (steps,):
-            raise ValueError(
-                f"n_step={steps}: rows have rewards of shape {tuple(r_t.shape[1:])} "
-                f"instead of ({steps},); the actors have to make them so"
-            )
-        return n_step_return(r_t, discount_t)
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         """On the device; float64 (the replay's probabilities) becomes float32."""

@@ -7,9 +7,6 @@
     w     = (1 / P)^beta / max over the batch of (1 / P)^beta
     loss  = mean over the batch of w l
 
-With n steps r_t and discount_t are those of the window (Sutton and Barto, 2018, eq.
-7.1; Hessel et al., 2018): R = sum_k (prod_{j<k} discount_j) r_k, D = prod discount_k.
-
 Double Q-learning: van Hasselt, Guez and Silver, 2016, eq. 4. Prioritised replay:
 Schaul et al., 2016, sec. 3.4. The weighted mean is Acme's: it divides by the batch's
 size, where torchrl divides by the sum of the weights. `discount_t` is the discount
@@ -31,18 +28,6 @@ def double_q_target(
     a_t = q_online_t.argmax(dim=-1, keepdim=True)
     v_t = q_target_t.gather(-1, a_t).squeeze(-1)
     return (r_t + discount_t * v_t).detach()
-
-
-def n_step_return(
-    r: Float[Tensor, "batch steps"], discount: Float[Tensor, "batch steps"]
-) -> tuple[Float[Tensor, " batch"], Float[Tensor, " batch"]]:
-    """The rewards of a window as one, and the discount of the state at its end.
-
-    What comes after a terminal state of the window (discount 0) counts for nothing.
-    """
-    reached = discount.cumprod(-1)
-    before = torch.cat([torch.ones_like(reached[:, :1]), reached[:, :-1]], -1)
-    return (before * r).sum(-1), reached[:, -1]
 
 
 def td_error(

@@ -21,6 +21,7 @@ from sim import environment
 from sim.bank import Bank
 from sim.environment import EnvironmentConfig, Outcome, State
 from sim.observation import Observation, observe_batch
+from sim.scene import ObjectType
 
 Choice = Callable[[Bank, Int[Array, ""]], Int[Array, " controlled"]]
 """The rows that a fresh episode of a scene controls; hashable, of a fixed length."""
@@ -43,6 +44,8 @@ class NearestToSdc:
     """Controlled objects, the SDC included."""
     moving: bool = False
     """Only objects that the log moves by `MOVES` metres or more; the SDC always."""
+    vehicles: bool = False
+    """Only vehicles; the SDC always."""
 
     def __call__(self, bank: Bank, scene: Int[Array, ""]) -> Int[Array, " controlled"]:
         """Those recorded at `current_step`, nearest first, ties by row."""
@@ -51,6 +54,8 @@ class NearestToSdc:
         if self.moving:
             moved = bank.route_end[scene] - bank.route_start[scene]
             valid = valid & (moved >= MOVES)
+        if self.vehicles:
+            valid = valid & (bank.object_type[scene] == ObjectType.VEHICLE)
         objects = valid.shape[0]
         is_sdc = jnp.arange(objects) == sdc
         away = jnp.hypot(row[:, 0] - row[sdc, 0], row[:, 1] - row[sdc, 1])

@@ -42,7 +42,15 @@ from sim.features import (
     route_features,
 )
 from sim.tables import ROAD_CLASSES
-from sim.world import View, World, exists, logged_world, row_of, world_of
+from sim.world import (
+    View,
+    World,
+    exists,
+    logged_world,
+    row_of,
+    simulated_world,
+    world_of,
+)
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,32 @@ def observe(bank: Bank, view: View, config: ObservationConfig) -> Observation:
     return jax.vmap(one)(view.controlled, view.history, view.history_valid)
 
 
+def observe_first(bank: Bank, view: View, config: ObservationConfig) -> Observation:
+    """What the first controlled object sees; the others are where they are simulated.
+
+    `observe`'s first, for views that are many and of one object each: of the others'
+    states only those that it sees are read.
+    """
+    row, own = bank.log[view.scene, view.step], view.controlled
+    now, now_valid = view.history[:, -1], view.history_valid[:, -1]
+    others = Others(
+        row[:, 0].at[own].set(now[:, 0], mode="drop"),
+        row[:, 1].at[own].set(now[:, 1], mode="drop"),
+        bank.log_valid[view.scene, view.step].at[own].set(now_valid, mode="drop"),
+        functools.partial(simulated_world, bank, view),
+    )
+    return _observe_one(
+        bank,
+        view.scene,
+        view.step,
+        others,
+        config,
+        own[0],
+        view.history[0],
+        view.history_valid[0],
+    )
+
+
 class Others(NamedTuple):
     """All objects of a scene now, and the last states of some of them."""
 
@@ -197,13 +231,40 @@ def observe_batch(bank: Bank, view: View, config: ObservationConfig) -> Observat
     (CPU only: not tried elsewhere). A batch of one object is computed as two: axes of
     length one compile to other arithmetic.
     """
-    alone = view.controlled.shape == (1, 1)
+    return _apart(_observe_views, bank, view, config, view.controlled.size == 1)
+
+
+def observe_first_batch(
+    bank: Bank, view: View, config: ObservationConfig
+) -> Observation:
+    """What the first controlled object of each scene sees, amid the others.
+
+    As `observe_batch`, without what the others see: axis `batch` in front.
+    """
+    if view.controlled.shape[1] == 1:
+        seen = observe_batch(bank, view, config)
+        return jax.tree.map(lambda values: values[:, 0], seen)
+    return _apart(_observe_firsts, bank, view, config, view.controlled.shape[0] == 1)
+
+
+def _apart(
+    observing: Callable[[Bank, View, ObservationConfig], Observation],
+    bank: Bank,
+    view: View,
+    config: ObservationConfig,
+    alone: bool,
+) -> Observation:
     if alone:
         view = jax.tree.map(lambda value: jnp.concatenate([value, value]), view)
-    batched = apart(_observe_views(bank, view, config=config))
+    batched = apart(observing(bank, view, config))
     return jax.tree.map(lambda value: value[:1], batched) if alone else batched
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def _observe_views(bank: Bank, view: View, config: ObservationConfig) -> Observation:
     return jax.vmap(observe, in_axes=(None, 0, None))(bank, view, config)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _observe_firsts(bank: Bank, view: View, config: ObservationConfig) -> Observation:
+    return jax.vmap(observe_first, in_axes=(None, 0, None))(bank, view, config)

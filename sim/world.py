@@ -58,6 +58,19 @@ def world_of(bank: Bank, view: View) -> World:
     )
 
 
+def simulated_world(bank: Bank, view: View, rows: Int[Array, " objects"]) -> World:
+    """Some objects, those that are controlled where they were simulated."""
+    logged = logged_world(bank, view, rows)
+    same = rows[:, None] == view.controlled[None]
+    controlled, slot = same.any(1), jnp.argmax(same, 1)
+    history = view.history[slot]
+    simulated = _motion(history[..., :2], history[..., 2], history[..., 3:])
+    return logged._replace(
+        motion=jnp.where(controlled[:, None, None], simulated, logged.motion),
+        valid=jnp.where(controlled[:, None], view.history_valid[slot], logged.valid),
+    )
+
+
 def _motion(
     position: Float[Array, "objects history 2"],
     yaw: Float[Array, "objects history"],

@@ -65,7 +65,7 @@ _act, _traces = scenes.counted(functools.partial(acting.act, config=CONFIG))
 def scans(file: BankFile, epsilon: np.ndarray, seed: int = 0) -> list[Scan]:
     """Several calls, one after the other."""
     start_key, *keys = jax.random.split(jax.random.key(seed), SCANS + 1)
-    running = _start(start_key, file.bank, ENVIRONMENTS, CONFIG.environment)
+    running = _start(start_key, file.bank, ENVIRONMENTS, CONFIG)
     results = []
     for key in keys:
         after, batch = _act(key, file.bank, weights(), running, jnp.asarray(epsilon))
@@ -75,9 +75,17 @@ def scans(file: BankFile, epsilon: np.ndarray, seed: int = 0) -> list[Scan]:
 
 
 def joined(results: list[Scan]) -> Transitions:
-    """The scans' transitions behind one another."""
-    return jax.tree.map(
+    """The scans' transitions behind one another, without the axis of the one object."""
+    every = jax.tree.map(
         lambda *parts: np.concatenate(parts), *(scan.batch for scan in results)
+    )
+    assert every.present.all()
+    shared = ("scene", "step", "q_values")
+    return Transitions(
+        **{
+            name: values if name in shared else values[:, :, 0]
+            for name, values in every._asdict().items()
+        }
     )
 
 
@@ -199,7 +207,7 @@ def test_scans_depend_on_the_key_alone(file: BankFile) -> None:
 
 
 def test_acting_compiles_once(file: BankFile) -> None:
-    running = _start(jax.random.key(0), file.bank, ENVIRONMENTS, CONFIG.environment)
+    running = _start(jax.random.key(0), file.bank, ENVIRONMENTS, CONFIG)
     for seed in range(3):
         epsilon = np.full(ENVIRONMENTS, 0.1 * seed, np.float32)
         running, _ = _act(

@@ -1,5 +1,7 @@
 """Which objects a fresh episode controls, and whole steps with auto-reset."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from sim.environment import EnvironmentConfig, State
 from sim.episodes import NearestToSdc, sdc_only
 from sim.observation import ObservationConfig, observe_batch
 from sim.procedural import generate_many
+from sim.scene import ObjectType
 from tests import scenes
 
 CONFIG = EnvironmentConfig(
@@ -31,15 +34,20 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> BankFile:
 
 @pytest.fixture(scope="module")
 def queue(tmp_path_factory: pytest.TempPathFactory) -> BankFile:
-    """Four others at 30, 10, 20 and 5 m: the third stands, the last comes later."""
+    """Four others at 30, 10, 20 and 5 m: the third stands, the last comes later.
+
+    The nearest that is there is a cyclist.
+    """
     others = [(30, 10.0), (10, 10.0), (20, 0.0), (5, 10.0)]
     drivers = [scenes.driver()]
     drivers += [scenes.driver(y=float(y), speed=speed) for y, speed in others]
     valid = np.ones((5, STEPS), bool)
     valid[4, : NOW + 1] = False
-    return scenes.bank_of(
-        [scenes.scene_of(drivers, valid=valid)], tmp_path_factory.mktemp("queue")
-    )
+    scene = scenes.scene_of(drivers, valid=valid)
+    kinds = scene.object_types.copy()
+    kinds[2] = ObjectType.CYCLIST
+    scene = dataclasses.replace(scene, object_types=kinds)
+    return scenes.bank_of([scene], tmp_path_factory.mktemp("queue"))
 
 
 def test_the_nearest_are_those_recorded_at_the_start(queue: BankFile) -> None:
@@ -47,11 +55,12 @@ def test_the_nearest_are_those_recorded_at_the_start(queue: BankFile) -> None:
         NearestToSdc(3): [0, 2, 3],
         NearestToSdc(7): [0, 2, 3, 1, 5, 5, 5],
         NearestToSdc(3, moving=True): [0, 2, 1],
+        NearestToSdc(3, vehicles=True): [0, 3, 1],
+        NearestToSdc(3, moving=True, vehicles=True): [0, 1, 5],
         sdc_only: [0],
     }
     for choose, rows in chosen.items():
-        begin = episodes.starts(queue.bank, choose, CONFIG)
-        assert begin.controlled[0].tolist() == rows
+        assert choose(queue.bank, jnp.int32(0)).tolist() == rows
 
 
 def test_starts_are_the_scenes_resets(made: BankFile) -> None:

@@ -240,35 +240,3 @@ def test_the_policy_is_the_mean_of_the_weights_where_that_is_asked_for(
         expected = expected + share * (learner.vector() - expected)
     np.testing.assert_allclose(learner.policy_vector(), expected, atol=1e-6)
     assert (learner.policy_vector() != learner.vector()).any() == (average_updates > 0)
-
-
-def test_n_steps_equal_one_step_of_their_sum():
-    """Rewards 0.5, 0, 0.5 at discount 0.5: 0.625, and 1/8 of the value at the end."""
-    batch = next(make_batches())
-    window = batch._replace(
-        r_t=np.tile(np.array([0.5, 0.0, 0.5], np.float32), (32, 1)),
-        discount_t=np.ones((32, 3), np.float32),
-    )
-    summed = batch._replace(
-        r_t=np.full(32, 0.625, np.float32), discount_t=np.full(32, 0.25, np.float32)
-    )
-    three = make_learner(discount=0.5, n_step=3).update(window)
-    one = make_learner(discount=0.5).update(summed)
-    assert three.loss == pytest.approx(one.loss, rel=1e-6)
-    np.testing.assert_allclose(three.priorities, one.priorities, rtol=1e-6)
-
-
-def test_rewards_of_n_steps_are_clipped_one_by_one():
-    batch = next(make_batches())
-    ones = np.ones((32, 2), np.float32)
-    results = [
-        make_learner(n_step=2).update(batch._replace(r_t=size * ones, discount_t=ones))
-        for size in (np.float32(1), np.float32(9))
-    ]
-    assert results[0].loss == results[1].loss
-    assert results[0].priorities.min() > 1.5  # 1 + 0.99, but for the first values
-
-
-def test_n_steps_need_rows_of_as_many():
-    with pytest.raises(ValueError, match=r"n_step=3: rows have rewards of shape \(\)"):
-        make_learner(n_step=3).update(next(make_batches()))

@@ -7,7 +7,6 @@ from learner.targets import (
     double_q_target,
     huber,
     importance_weights,
-    n_step_return,
     td_error,
     weighted_mean,
 )
@@ -69,18 +68,3 @@ def test_weighted_mean_is_acmes():
     # (1 * 2 + 0.5 * 4) / 2 = 2, where sum(w l) / sum(w) would be 2.67.
     mean = weighted_mean(torch.tensor([2.0, 4.0]), torch.tensor([1.0, 0.5]))
     assert float(mean) == 2.0
-
-
-def test_n_step_returns_by_hand():
-    """Discount 0.5: 1 + 0.5 * 2 + 0.25 * 4 = 3, then 1/8; a terminal state cuts."""
-    r = torch.tensor([[1.0, 2.0, 4.0], [1.0, 2.0, 4.0], [1.0, 2.0, 4.0]])
-    discount = torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.0, 0.5], [0.5, 0.5, 0.0]])
-    total, end = n_step_return(r, discount)
-    torch.testing.assert_close(total, torch.tensor([3.0, 2.0, 3.0]))
-    torch.testing.assert_close(end, torch.tensor([0.125, 0.0, 0.0]))
-
-
-def test_one_step_is_the_reward():
-    r, discount = torch.randn(5, 1), torch.rand(5, 1)
-    total, end = n_step_return(r, discount)
-    torch.testing.assert_close((total, end), (r[:, 0], discount[:, 0]))
