@@ -74,7 +74,9 @@ class Windows:
 
         The replay's limiter is checked for batches of one size.
         """
-        rows = np.concatenate([*self._waiting, self.add(transitions, version)])
+        made = self.add(transitions, version)
+        # Without the type it would be packed: rows are padded to 64 bytes.
+        rows = np.concatenate([*self._waiting, made], dtype=made.dtype)
         whole = len(rows) - len(rows) % size
         self._waiting = [rows[whole:]]
         return [rows[first : first + size] for first in range(0, whole, size)]

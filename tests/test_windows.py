@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from actors.acting import Transitions
+from actors.rows import row_spec
 from actors.windows import Windows
 
 HISTORY = 2
@@ -170,6 +171,19 @@ def test_batches_are_of_one_size() -> None:
         for _ in range(4)
     ]
     assert sizes == [[4], [4, 4], [4], [4, 4]]
+
+
+def test_batches_are_of_the_replays_layout() -> None:
+    shape = (6, 2, 2)
+    log = Log(np.ones(shape, bool), np.zeros(shape, bool), np.zeros(shape, bool))
+    windows = Windows(n_step=2, discount=0.5, actor=0)
+    batches = windows.batches(transitions_of(log), 0, 3)
+    batches += windows.batches(transitions_of(log), 0, 3)
+    spec = row_spec(HISTORY, n_step=2, others=1)
+    assert {spec.check(rows).dtype for rows in batches} == {spec.dtype}
+    assert spec.dtype.itemsize > sum(
+        np.dtype(spec.dtype[name]).itemsize for name in spec.dtype.names
+    )
 
 
 def test_no_step_at_all_is_refused() -> None:
