@@ -23,7 +23,6 @@ and is padded to 64 bytes, so that rows behind it stay aligned.
     Weights       values u32, version i64, layout hash ASCII[24]; then f32[values]
 """
 
-import enum
 import struct
 from dataclasses import dataclass
 from typing import final
@@ -31,44 +30,44 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, UInt8, UInt64
 
-from replay.spec import ReplayError, RowSpec, Sample
+from replay.header import (
+    COMMON,
+    HEADER_BYTES,
+    MAX_HOLD_MS,
+    MAX_NUMBER,
+    MAX_REPLY_BYTES,
+    MAX_ROWS,
+    MAX_UPDATES,
+    NO_SCHEMA,
+    WIRE_VERSION,
+    Kind,
+    Status,
+    WireError,
+    check_count,
+    check_length,
+    header,
+    open_header,
+    reason_of,
+    status_of,
+)
+from replay.spec import RowSpec, Sample
 
-WIRE_VERSION = 3
-MAGIC = b"SLST"
-HEADER_BYTES = 64
-MAX_ROWS = 1 << 20  # per message
-MAX_UPDATES = 1 << 20
-MAX_REPLY_BYTES = 256 << 20
-MAX_NUMBER = 1 << 62  # of epochs and sequences: the next one must fit as well
-MAX_HOLD_MS = 60_000  # longer ones are cut: nobody may keep the service's memory
-_COMMON = struct.Struct("<4sHH8s")
-_NO_SCHEMA = bytes(8)
-
-
-class WireError(ReplayError):
-    """A payload is not the message that it should be."""
-
-
-class Kind(enum.IntEnum):
-    """Which message a payload is."""
-
-    INSERT = 1
-    INSERT_REPLY = 2
-    SAMPLE_REQUEST = 3
-    SAMPLE_REPLY = 4
-    FETCH_REQUEST = 5
-    WEIGHTS = 6
-
-
-class Status(enum.IntEnum):
-    """What became of a request."""
-
-    OK = 0
-    BUSY = 1  # the rate limiter did not admit it in time; ask again
-    GAP = 2  # not the next sequence; go back to the one in the reply
-    STALE = 3  # a newer process writes under this number
-    REFUSED = 4  # it can never be accepted; the reason says why
-
+__all__ = [
+    "HEADER_BYTES",
+    "MAX_NUMBER",
+    "MAX_REPLY_BYTES",
+    "WIRE_VERSION",
+    "FetchRequest",
+    "Insert",
+    "InsertReply",
+    "SampleReply",
+    "SampleReplyBuffer",
+    "SampleRequest",
+    "Status",
+    "Weights",
+    "WireError",
+    "encode_sample_refusal",
+]
 
 _INSERT = struct.Struct("<IIQQQIQ")
 _INSERT_REPLY = struct.Struct("<HxxIQQQ")
@@ -76,63 +75,6 @@ _SAMPLE_REQUEST = struct.Struct("<IIII")
 _SAMPLE_REPLY = struct.Struct("<HxxIQQd")
 _FETCH_REQUEST = struct.Struct("<IxxxxQ")
 _WEIGHTS = struct.Struct("<Ixxxxq24s")
-
-
-def _header(kind: Kind, schema_hash: bytes, rest: bytes) -> bytes:
-    """The 64 bytes that begin a message."""
-    head = _COMMON.pack(MAGIC, WIRE_VERSION, kind, schema_hash) + rest
-    return head.ljust(HEADER_BYTES, b"\0")
-
-
-def _open(payload: bytes, kind: Kind, schema_hash: bytes) -> None:
-    """Checks the common header; raises `WireError` naming what differs."""
-    name = kind.name
-    if len(payload) < HEADER_BYTES:
-        raise WireError(f"{name}: {len(payload)} bytes, a header has {HEADER_BYTES}")
-    magic, version, got_kind, got_hash = _COMMON.unpack_from(payload)
-    if magic != MAGIC:
-        raise WireError(f"{name}: begins with {magic!r}, not {MAGIC!r}")
-    if version != WIRE_VERSION:
-        raise WireError(
-            f"{name}: wire version {version}, this process speaks {WIRE_VERSION}; "
-            "run the same release everywhere"
-        )
-    if got_kind != kind:
-        raise WireError(f"{name}: got a message of kind {got_kind}")
-    if got_hash != schema_hash:
-        raise WireError(
-            f"{name}: row schema {got_hash.hex()}, expected {schema_hash.hex()}; "
-            "actors, replay and learner must run with the same row layout"
-        )
-
-
-def _check_length(payload: bytes, kind: Kind, body: int) -> None:
-    """A body of exactly `body` bytes must follow the header."""
-    if len(payload) != HEADER_BYTES + body:
-        raise WireError(
-            f"{kind.name}: {len(payload) - HEADER_BYTES} bytes after the header, "
-            f"expected {body}"
-        )
-
-
-def _check_count(kind: Kind, what: str, count: int, most: int) -> None:
-    if not count <= most:
-        raise WireError(f"{kind.name}: {count} {what}, at most {most} are allowed")
-
-
-def _reason(payload: bytes, kind: Kind) -> str:
-    """The text that follows a reply's header."""
-    try:
-        return payload[HEADER_BYTES:].decode()
-    except UnicodeDecodeError as error:
-        raise WireError(f"{kind.name}: the reason is not UTF-8") from error
-
-
-def _status(value: int, kind: Kind) -> Status:
-    try:
-        return Status(value)
-    except ValueError as error:
-        raise WireError(f"{kind.name}: unknown status {value}") from error
 
 
 @final
@@ -159,18 +101,18 @@ class Insert:
             self.hold_ms,
             self.life,
         )
-        return _header(Kind.INSERT, spec.schema_hash, head) + self.rows.tobytes()
+        return header(Kind.INSERT, spec.schema_hash, head) + self.rows.tobytes()
 
     @staticmethod
     def decode(payload: bytes, spec: RowSpec) -> "Insert":
         """Parses and checks; the rows are a view of the payload."""
-        _open(payload, Kind.INSERT, spec.schema_hash)
+        open_header(payload, Kind.INSERT, spec.schema_hash)
         writer, count, epoch, sequence, base, hold_ms, life = _INSERT.unpack_from(
-            payload, _COMMON.size
+            payload, COMMON.size
         )
-        _check_count(Kind.INSERT, "rows", count, MAX_ROWS)
-        _check_length(payload, Kind.INSERT, count * spec.row_bytes)
-        _check_count(Kind.INSERT, "as its number", max(epoch, sequence), MAX_NUMBER)
+        check_count(Kind.INSERT, "rows", count, MAX_ROWS)
+        check_length(payload, Kind.INSERT, count * spec.row_bytes)
+        check_count(Kind.INSERT, "as its number", max(epoch, sequence), MAX_NUMBER)
         if count == 0 or base > sequence:
             raise WireError(
                 f"INSERT: {count} rows as sequence {sequence} after {base}; a batch "
@@ -205,22 +147,22 @@ class InsertReply:
         head = _INSERT_REPLY.pack(
             self.status, self.writer, self.epoch, self.next_sequence, self.incarnation
         )
-        return _header(Kind.INSERT_REPLY, spec.schema_hash, head) + self.reason.encode()
+        return header(Kind.INSERT_REPLY, spec.schema_hash, head) + self.reason.encode()
 
     @staticmethod
     def decode(payload: bytes, spec: RowSpec) -> "InsertReply":
         """Parses and checks."""
-        _open(payload, Kind.INSERT_REPLY, spec.schema_hash)
+        open_header(payload, Kind.INSERT_REPLY, spec.schema_hash)
         status, writer, epoch, next_sequence, incarnation = _INSERT_REPLY.unpack_from(
-            payload, _COMMON.size
+            payload, COMMON.size
         )
         return InsertReply(
-            status=_status(status, Kind.INSERT_REPLY),
+            status=status_of(status, Kind.INSERT_REPLY),
             writer=writer,
             epoch=epoch,
             next_sequence=next_sequence,
             incarnation=incarnation,
-            reason=_reason(payload, Kind.INSERT_REPLY),
+            reason=reason_of(payload, Kind.INSERT_REPLY),
         )
 
 
@@ -241,7 +183,7 @@ class SampleRequest:
             self.batch_size, self.batches, len(self.ids), self.hold_ms
         )
         return (
-            _header(Kind.SAMPLE_REQUEST, spec.schema_hash, head)
+            header(Kind.SAMPLE_REQUEST, spec.schema_hash, head)
             + self.ids.astype("<u8").tobytes()
             + self.priorities.astype("<f8").tobytes()
         )
@@ -250,17 +192,17 @@ class SampleRequest:
     def decode(payload: bytes, spec: RowSpec) -> "SampleRequest":
         """Parses and checks."""
         kind = Kind.SAMPLE_REQUEST
-        _open(payload, kind, spec.schema_hash)
+        open_header(payload, kind, spec.schema_hash)
         batch_size, batches, updates, hold_ms = _SAMPLE_REQUEST.unpack_from(
-            payload, _COMMON.size
+            payload, COMMON.size
         )
-        _check_count(kind, "updates", updates, MAX_UPDATES)
-        _check_count(kind, "rows asked for", batch_size * batches, MAX_ROWS)
-        _check_length(payload, kind, 16 * updates)
+        check_count(kind, "updates", updates, MAX_UPDATES)
+        check_count(kind, "rows asked for", batch_size * batches, MAX_ROWS)
+        check_length(payload, kind, 16 * updates)
         if batch_size * batches == 0:
             raise WireError(f"{kind.name}: {batches} batches of {batch_size} rows")
         size = batch_size * batches * (16 + spec.row_bytes)
-        _check_count(kind, "bytes asked for", size, MAX_REPLY_BYTES)
+        check_count(kind, "bytes asked for", size, MAX_REPLY_BYTES)
         return SampleRequest(
             batch_size=batch_size,
             batches=batches,
@@ -283,15 +225,15 @@ class FetchRequest:
     def encode(self, spec: RowSpec) -> bytes:
         """A header only."""
         head = _FETCH_REQUEST.pack(self.limit, self.first_id)
-        return _header(Kind.FETCH_REQUEST, spec.schema_hash, head)
+        return header(Kind.FETCH_REQUEST, spec.schema_hash, head)
 
     @staticmethod
     def decode(payload: bytes, spec: RowSpec) -> "FetchRequest":
         """Parses and checks."""
-        _open(payload, Kind.FETCH_REQUEST, spec.schema_hash)
-        limit, first_id = _FETCH_REQUEST.unpack_from(payload, _COMMON.size)
-        _check_count(Kind.FETCH_REQUEST, "rows asked for", limit, MAX_ROWS)
-        _check_length(payload, Kind.FETCH_REQUEST, 0)
+        open_header(payload, Kind.FETCH_REQUEST, spec.schema_hash)
+        limit, first_id = _FETCH_REQUEST.unpack_from(payload, COMMON.size)
+        check_count(Kind.FETCH_REQUEST, "rows asked for", limit, MAX_ROWS)
+        check_length(payload, Kind.FETCH_REQUEST, 0)
         return FetchRequest(first_id=first_id, limit=limit)
 
 
@@ -314,7 +256,7 @@ class SampleReplyBuffer:
     def seal(self, *, size: int, inserts: int, mass: float) -> bytearray:
         """Writes the header and returns the whole message."""
         head = _SAMPLE_REPLY.pack(Status.OK, len(self.ids), size, inserts, mass)
-        self.payload[:HEADER_BYTES] = _header(
+        self.payload[:HEADER_BYTES] = header(
             Kind.SAMPLE_REPLY, self._spec.schema_hash, head
         )
         return self.payload
@@ -323,7 +265,7 @@ class SampleReplyBuffer:
 def encode_sample_refusal(status: Status, reason: str, spec: RowSpec) -> bytes:
     """A sample reply without rows: busy, or refused with a reason."""
     head = _SAMPLE_REPLY.pack(status, 0, 0, 0, 0.0)
-    return _header(Kind.SAMPLE_REPLY, spec.schema_hash, head) + reason.encode()
+    return header(Kind.SAMPLE_REPLY, spec.schema_hash, head) + reason.encode()
 
 
 @final
@@ -339,14 +281,14 @@ class SampleReply:
     def decode(payload: bytes, spec: RowSpec) -> "SampleReply":
         """Parses and checks; the arrays are views of the payload."""
         kind = Kind.SAMPLE_REPLY
-        _open(payload, kind, spec.schema_hash)
-        code, count, *told = _SAMPLE_REPLY.unpack_from(payload, _COMMON.size)
-        status, (size, inserts, mass) = _status(code, kind), told
+        open_header(payload, kind, spec.schema_hash)
+        code, count, *told = _SAMPLE_REPLY.unpack_from(payload, COMMON.size)
+        status, (size, inserts, mass) = status_of(code, kind), told
         if status is not Status.OK:
-            reason = _reason(payload, kind)
+            reason = reason_of(payload, kind)
             return SampleReply(status=status, reason=reason, sample=None)
-        _check_count(kind, "rows", count, MAX_ROWS)
-        _check_length(payload, kind, count * (16 + spec.row_bytes))
+        check_count(kind, "rows", count, MAX_ROWS)
+        check_length(payload, kind, count * (16 + spec.row_bytes))
         start = HEADER_BYTES
         sample = Sample(
             ids=np.frombuffer(payload, "<u8", count, start),
@@ -381,16 +323,15 @@ class Weights:
             )
         head = _WEIGHTS.pack(len(self.vector), self.version, name)
         return (
-            _header(Kind.WEIGHTS, _NO_SCHEMA, head)
-            + self.vector.astype("<f4").tobytes()
+            header(Kind.WEIGHTS, NO_SCHEMA, head) + self.vector.astype("<f4").tobytes()
         )
 
     @staticmethod
     def decode(payload: bytes) -> "Weights":
         """Parses and checks; the vector is its own copy."""
-        _open(payload, Kind.WEIGHTS, _NO_SCHEMA)
-        count, version, name = _WEIGHTS.unpack_from(payload, _COMMON.size)
-        _check_length(payload, Kind.WEIGHTS, 4 * count)
+        open_header(payload, Kind.WEIGHTS, NO_SCHEMA)
+        count, version, name = _WEIGHTS.unpack_from(payload, COMMON.size)
+        check_length(payload, Kind.WEIGHTS, 4 * count)
         try:
             layout_hash = name.rstrip(b"\0").decode("ascii")
         except UnicodeDecodeError as error:
