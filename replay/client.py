@@ -14,9 +14,10 @@ import numpy as np
 import zenoh
 from jaxtyping import Float, Integer
 
+from replay.arena import Arena, make_arena
 from replay.control import StatsReply, decode
 from replay.keys import RunKeys
-from replay.session import ask, direct
+from replay.session import ask, direct, shares_memory
 from replay.spec import ReplayError, RowSpec, Sample
 from replay.wire import (
     FetchRequest,
@@ -24,6 +25,7 @@ from replay.wire import (
     SampleRequest,
     Status,
     WireError,
+    body_bytes,
 )
 from replay.writer import Writer
 
@@ -53,8 +55,11 @@ class _Request:
         updates: list[tuple[np.ndarray, np.ndarray]],
         events: "queue.SimpleQueue[tuple[_Request, zenoh.ZBytes | None]]",
         on_answer: Callable[[], object],
+        arena: Arena | None,
     ) -> None:
         self.updates = updates
+        self.arena = arena
+        self.place = arena.take() if arena else None
         self._events = events
         self._on_answer = on_answer
         self._answered = False
@@ -93,6 +98,8 @@ class Sampler:
         """`hold_s`: how long the service may wait for its limiter per query.
 
         `on_answer` is called on Zenoh's thread when a query has ended.
+        A service on this machine puts the rows into this process's memory
+        (`replay.arena`) if the session was opened with shared memory.
         """
         if min(batch_size, batches_per_reply, in_flight) < 1:
             raise ReplayError(
@@ -107,6 +114,9 @@ class Sampler:
         self._in_flight = in_flight
         self._hold_s = hold_s
         self._on_answer = on_answer
+        self._shared_memory = shares_memory(session)
+        self._arena: Arena | None = None
+        self._placed = 0
         self._events: queue.SimpleQueue[tuple[_Request, zenoh.ZBytes | None]]
         self._events = queue.SimpleQueue()
         self._outstanding = 0
@@ -120,6 +130,11 @@ class Sampler:
     def waited_s(self) -> float:
         """Total time that `sample` has spent waiting for an answer."""
         return self._waited_s
+
+    @property
+    def placed(self) -> int:
+        """Answers whose rows the service put into this process's memory."""
+        return self._placed
 
     def sample(self, timeout: float) -> Sample:
         """The next batch; raises `ReplayTimeout` after `timeout` seconds."""
@@ -166,13 +181,15 @@ class Sampler:
         kept = -(-len(self._ready) // self._batches)
         while self._outstanding + kept < self._in_flight:
             updates, self._updates = self._updates, []
-            request = _Request(updates, self._events, self._on_answer)
+            arena = self._open_arena()
+            request = _Request(updates, self._events, self._on_answer, arena)
             message = SampleRequest(
                 batch_size=self._batch_size,
                 batches=self._batches,
                 hold_ms=int(self._hold_s * 1e3),
                 ids=np.concatenate([np.zeros(0, np.uint64)] + [u[0] for u in updates]),
                 priorities=np.concatenate([np.zeros(0)] + [u[1] for u in updates]),
+                place=request.place,
             )
             self._outstanding += 1
             self._session.get(
@@ -183,6 +200,45 @@ class Sampler:
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 timeout=self._hold_s + _ANSWER_MARGIN_S,
             )
+
+    def _open_arena(self) -> Arena | None:
+        """Where answers may lie, if anywhere."""
+        if self._shared_memory and self._arena is None:
+            # One part for each query in flight and as many that the caller looks at,
+            # and one for each that it has just taken.
+            self._arena = make_arena(
+                parts=2 * self._in_flight + 2,
+                part_bytes=body_bytes(self._spec, self._batch_size * self._batches),
+            )
+            self._shared_memory = self._arena is not None
+        return self._arena
+
+    def _give_up_arena(self) -> None:
+        """What is lent stays valid; the next query that names a place has a new one."""
+        if self._arena is not None:
+            self._arena.close()
+            self._arena = None
+
+    def _decode(self, request: _Request, payload: bytes) -> SampleReply:
+        """The answer; its place is lent to its rows, or free again."""
+        arena, place = request.arena, request.place
+        if arena is None or place is None:
+            return SampleReply.decode(payload, self._spec)
+        used = False
+
+        def view(length: int) -> np.ndarray:
+            nonlocal used
+            used = True
+            return arena.view(place, length)
+
+        reply = SampleReply.decode(payload, self._spec, view)
+        self._placed += used
+        if not used:
+            arena.give_back(place)
+            if reply.sample is not None:  # the service is somewhere else
+                self._shared_memory = False
+                self._give_up_arena()
+        return reply
 
     def _wait(self, longest_s: float) -> None:
         """Until an answer comes, or it is time to try again."""
@@ -205,13 +261,14 @@ class Sampler:
         """Keeps the rows of an answer; a failed query's updates are sent again."""
         self._outstanding -= 1
         if payload is None:
+            self._give_up_arena()  # it may still be answered, into its place
             first, longest = _RETRY_S
             self._updates = request.updates + self._updates
             self._retry_at = time.monotonic() + min(longest, first * 2**self._failures)
             self._failures = min(self._failures + 1, 10)
             return
         self._failures, self._retry_at = 0, 0.0
-        reply = SampleReply.decode(payload.to_bytes(), self._spec)
+        reply = self._decode(request, payload.to_bytes())
         if reply.status is Status.REFUSED:
             raise ReplayError(f"replay refused to sample: {reply.reason}")
         if reply.sample is not None:

@@ -10,7 +10,7 @@ import struct
 
 from replay.spec import ReplayError
 
-WIRE_VERSION = 3
+WIRE_VERSION = 4
 MAGIC = b"SLST"
 HEADER_BYTES = 64
 MAX_ROWS = 1 << 20  # per message

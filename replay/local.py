@@ -196,12 +196,21 @@ class LocalReplay:
             mass=self.table.mass(),
         )
 
-    def sample_into_buffer(self, *, batch_size: int, batches: int) -> SampleReplyBuffer:
-        """Several batches, gathered straight into a reply."""
+    def sample_into_buffer(
+        self,
+        *,
+        batch_size: int,
+        batches: int,
+        payload: bytearray | None = None,
+        place: memoryview | None = None,
+    ) -> SampleReplyBuffer:
+        """Several batches, gathered straight into a reply (see `SampleReplyBuffer`)."""
         count = batch_size * batches
         if not self.may_sample(count):
             raise LimiterError(f"{count} samples before more is inserted")
-        buffer = SampleReplyBuffer(spec=self.spec, count=count)
+        buffer = SampleReplyBuffer(
+            spec=self.spec, count=count, payload=payload, place=place
+        )
         self.table.draw(
             batch_size=batch_size,
             ids=buffer.ids,

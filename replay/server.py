@@ -22,6 +22,7 @@ from typing import final
 
 import zenoh
 
+from replay.arena import Arenas
 from replay.control import StatsReply, encode
 from replay.counters import Counters, stats_reply
 from replay.inserts import InsertDesk
@@ -39,6 +40,7 @@ from replay.wire import (
     SampleRequest,
     Status,
     WireError,
+    body_bytes,
     encode_sample_refusal,
 )
 
@@ -90,6 +92,9 @@ class ReplayServer:
             incarnation=self._incarnation,
             check_rows=lambda rows: self._check_batches(insert_rows=rows),
         )
+        self._arenas = Arenas()
+        # The last reply's: Zenoh has copied it, and fresh pages cost a fault each.
+        self._payload = bytearray()
         self._hub = hub
         self._bounded = largest is not None
         # The largest batches seen, or that may come.
@@ -125,6 +130,7 @@ class ReplayServer:
                 for name, query, arrived in self._next_events():
                     handlers[name][1](query, arrived)
                 self._tend_disk()
+                self._arenas.let_go(time.monotonic())
                 self._admit()
                 self._expire()
         finally:
@@ -180,9 +186,15 @@ class ReplayServer:
         if not self._samples or not self._replay.may_sample(self._samples[0].count):
             return False
         held = self._samples.popleft()
+        place = held.message.place
         buffer = self._replay.sample_into_buffer(
-            batch_size=held.message.batch_size, batches=held.message.batches
+            batch_size=held.message.batch_size,
+            batches=held.message.batches,
+            payload=self._payload,
+            place=place
+            and self._arenas.part(place, body_bytes(self._spec, held.count)),
         )
+        self._payload = buffer.payload
         self._counters.sample_wait_s += time.monotonic() - held.arrived
         answer(held.query, self._sealed(buffer))
         return True

@@ -33,6 +33,9 @@ _RETRY = {
 }
 
 
+_SEPARATE: set[str] = set()  # the sessions that were opened without shared memory
+
+
 class ConnectError(ReplayError):
     """A session cannot be opened; one line says which endpoint and what to do."""
 
@@ -116,9 +119,13 @@ def open_session(
             connect=connect, listen=listen, router=router, shared_memory=shared_memory
         )
         try:
-            return zenoh.open(config)
+            session = zenoh.open(config)
         except zenoh.ZError as error:
             reason = str(error)
+        else:
+            if not shared_memory:
+                _SEPARATE.add(str(session.zid()))
+            return session
         if "listener" in reason or "in use" in reason:
             raise ConnectError(_listen_message(listen, reason)) from None
         if time.monotonic() > deadline:
@@ -129,6 +136,11 @@ def open_session(
         # Zenoh offers no event for "someone listens now"; a refused connection
         # returns in milliseconds, so trying again is the wait.
         time.sleep(0.05)
+
+
+def shares_memory(session: zenoh.Session) -> bool:
+    """Whether the session was opened with shared memory allowed."""
+    return str(session.zid()) not in _SEPARATE
 
 
 def undeclare(*entities: Any) -> None:  # noqa: ANN401 (Zenoh has no common type)

@@ -14,22 +14,26 @@ and is padded to 64 bytes, so that rows behind it stay aligned.
                   hold ms u32, life u64; then rows
     InsertReply   status u16, writer u32, epoch u64, next sequence u64,
                   incarnation u64; then the reason as UTF-8
-    SampleRequest batch size u32, batches u32, updates u32, hold ms u32; then
-                  ids u64[updates], priorities f64[updates]
+    SampleRequest batch size u32, batches u32, updates u32, hold ms u32, and where
+                  the reply's body may lie: pid u32 (0: nowhere), fd u32, offset u64,
+                  token [16]; then ids u64[updates], priorities f64[updates]
     FetchRequest  limit u32, first id u64
-    SampleReply   status u16, rows u32, size u64, inserts u64, mass f64; then
-                  ids u64[rows], probabilities f64[rows], rows; or the reason.
+    SampleReply   status u16, placed u16, rows u32, size u64, inserts u64,
+                  mass f64; then ids u64[rows], probabilities f64[rows], rows (where
+                  the request said, if placed: `replay.arena`); or the reason.
                   It also answers FetchRequest (size and inserts bound the ids)
     Weights       values u32, version i64, layout hash ASCII[24]; then f32[values]
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
 import numpy as np
 from jaxtyping import Float, UInt8, UInt64
 
+from replay.arena import NO_PLACE, Place
 from replay.header import (
     COMMON,
     HEADER_BYTES,
@@ -66,13 +70,14 @@ __all__ = [
     "Status",
     "Weights",
     "WireError",
+    "body_bytes",
     "encode_sample_refusal",
 ]
 
 _INSERT = struct.Struct("<IIQQQIQ")
 _INSERT_REPLY = struct.Struct("<HxxIQQQ")
-_SAMPLE_REQUEST = struct.Struct("<IIII")
-_SAMPLE_REPLY = struct.Struct("<HxxIQQd")
+_SAMPLE_REQUEST = struct.Struct("<IIII")  # and a place
+_SAMPLE_REPLY = struct.Struct("<HHIQQd")
 _FETCH_REQUEST = struct.Struct("<IxxxxQ")
 _WEIGHTS = struct.Struct("<Ixxxxq24s")
 
@@ -176,12 +181,14 @@ class SampleRequest:
     hold_ms: int
     ids: UInt64[np.ndarray, " updates"]
     priorities: Float[np.ndarray, " updates"]  # float64, >= 0: |TD error|
+    place: Place | None = None  # of the reply's body, if the service can write there
 
     def encode(self, spec: RowSpec) -> bytes:
         """Header, ids, priorities."""
         head = _SAMPLE_REQUEST.pack(
             self.batch_size, self.batches, len(self.ids), self.hold_ms
         )
+        head += self.place.encode() if self.place else NO_PLACE
         return (
             header(Kind.SAMPLE_REQUEST, spec.schema_hash, head)
             + self.ids.astype("<u8").tobytes()
@@ -211,6 +218,7 @@ class SampleRequest:
             priorities=np.frombuffer(
                 payload, "<f8", updates, HEADER_BYTES + 8 * updates
             ),
+            place=Place.decode(payload, COMMON.size + _SAMPLE_REQUEST.size),
         )
 
 
@@ -237,25 +245,44 @@ class FetchRequest:
         return FetchRequest(first_id=first_id, limit=limit)
 
 
+def body_bytes(spec: RowSpec, count: int) -> int:
+    """Bytes of the ids, probabilities and rows of a sample reply."""
+    return count * (16 + spec.row_bytes)
+
+
 @final
 class SampleReplyBuffer:
     """A sample reply under construction: the table gathers straight into it."""
 
-    def __init__(self, *, spec: RowSpec, count: int) -> None:
-        """Reserves a header, ids, probabilities and rows for `count` rows."""
+    def __init__(
+        self,
+        *,
+        spec: RowSpec,
+        count: int,
+        payload: bytearray | None = None,
+        place: memoryview | None = None,
+    ) -> None:
+        """Room for `count` rows: at `place`, or in the message behind the header.
+
+        `payload`: a former message, used again if it has the right length.
+        """
+        size = HEADER_BYTES + (0 if place else body_bytes(spec, count))
+        if payload is None or len(payload) != size:
+            payload = bytearray(size)
         self._spec = spec
-        self.payload = bytearray(HEADER_BYTES + count * (16 + spec.row_bytes))
-        start = HEADER_BYTES
-        self.ids = np.frombuffer(self.payload, "<u8", count, start)
-        self.probabilities = np.frombuffer(
-            self.payload, "<f8", count, start + 8 * count
-        )
-        rows = np.frombuffer(self.payload, np.uint8, offset=start + 16 * count)
+        self._placed = place is not None
+        self.payload = payload
+        body = place if place else memoryview(payload)[HEADER_BYTES:]
+        self.ids = np.frombuffer(body, "<u8", count)
+        self.probabilities = np.frombuffer(body, "<f8", count, 8 * count)
+        rows = np.frombuffer(body, np.uint8, count * spec.row_bytes, 16 * count)
         self.rows = rows.reshape(count, spec.row_bytes)
 
     def seal(self, *, size: int, inserts: int, mass: float) -> bytearray:
         """Writes the header and returns the whole message."""
-        head = _SAMPLE_REPLY.pack(Status.OK, len(self.ids), size, inserts, mass)
+        head = _SAMPLE_REPLY.pack(
+            Status.OK, self._placed, len(self.ids), size, inserts, mass
+        )
         self.payload[:HEADER_BYTES] = header(
             Kind.SAMPLE_REPLY, self._spec.schema_hash, head
         )
@@ -264,7 +291,7 @@ class SampleReplyBuffer:
 
 def encode_sample_refusal(status: Status, reason: str, spec: RowSpec) -> bytes:
     """A sample reply without rows: busy, or refused with a reason."""
-    head = _SAMPLE_REPLY.pack(status, 0, 0, 0, 0.0)
+    head = _SAMPLE_REPLY.pack(status, 0, 0, 0, 0, 0.0)
     return header(Kind.SAMPLE_REPLY, spec.schema_hash, head) + reason.encode()
 
 
@@ -278,22 +305,34 @@ class SampleReply:
     sample: Sample | None  # None if and only if status is not OK
 
     @staticmethod
-    def decode(payload: bytes, spec: RowSpec) -> "SampleReply":
-        """Parses and checks; the arrays are views of the payload."""
+    def decode(
+        payload: bytes,
+        spec: RowSpec,
+        view: Callable[[int], UInt8[np.ndarray, " length"]] | None = None,
+    ) -> "SampleReply":
+        """Parses and checks; the arrays are views of the payload.
+
+        Or of `view(length)`, the bytes at the place that the request named, if the
+        service put the rows there.
+        """
         kind = Kind.SAMPLE_REPLY
         open_header(payload, kind, spec.schema_hash)
-        code, count, *told = _SAMPLE_REPLY.unpack_from(payload, COMMON.size)
+        code, placed, count, *told = _SAMPLE_REPLY.unpack_from(payload, COMMON.size)
         status, (size, inserts, mass) = status_of(code, kind), told
         if status is not Status.OK:
             reason = reason_of(payload, kind)
             return SampleReply(status=status, reason=reason, sample=None)
         check_count(kind, "rows", count, MAX_ROWS)
-        check_length(payload, kind, count * (16 + spec.row_bytes))
-        start = HEADER_BYTES
+        length = body_bytes(spec, count)
+        check_length(payload, kind, 0 if placed else length)
+        if placed and view is None:
+            raise WireError(f"{kind.name}: placed, but no place was named")
+        body = view(length) if placed and view else payload
+        start = 0 if placed else HEADER_BYTES
         sample = Sample(
-            ids=np.frombuffer(payload, "<u8", count, start),
-            probabilities=np.frombuffer(payload, "<f8", count, start + 8 * count),
-            rows=np.frombuffer(payload, spec.dtype, count, start + 16 * count),
+            ids=np.frombuffer(body, "<u8", count, start),
+            probabilities=np.frombuffer(body, "<f8", count, start + 8 * count),
+            rows=np.frombuffer(body, spec.dtype, count, start + 16 * count),
             size=size,
             inserts=inserts,
             mass=mass,

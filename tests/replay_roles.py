@@ -3,10 +3,12 @@
     python -m tests.replay_roles service ENDPOINT [FOLDER]
     python -m tests.replay_roles writer ENDPOINT WRITER EPOCH ROWS
     python -m tests.replay_roles checked ENDPOINT WRITER EPOCH
+    python -m tests.replay_roles reader ENDPOINT BATCHES
 
 The writer numbers its rows from `EPOCH * 1_000_000` and prints how many rows were
 acknowledged whenever that grows; the service prints `ready`. With a folder it is
-durable and its rows are checked ones; `checked` writes those until SIGTERM.
+durable and its rows are checked ones; `checked` writes those until SIGTERM. The reader
+checks what it draws and prints how many answers came through shared memory.
 """
 
 import signal
@@ -14,7 +16,7 @@ import sys
 import threading
 from pathlib import Path
 
-from replay.client import Writer
+from replay.client import Sampler, Writer
 from replay.server import ReplayServer
 from replay.session import open_session
 from tests.replay_durable_parts import CHECKED, LOADED, checked_rows
@@ -92,10 +94,25 @@ def write_checked(endpoint: str, writer: int, epoch: int) -> None:
     session.close()
 
 
+def read(endpoint: str, batches: int) -> None:
+    """Draws batches of 8 and checks every row."""
+    session = open_session(connect=[endpoint])
+    sampler = Sampler(session=session, keys=KEYS, spec=SPEC, batch_size=8)
+    for drawn in range(batches):
+        rows = sampler.sample(20.0).rows
+        assert (rows == make_rows(0, 1000)[rows["number"]]).all()
+        if drawn == 50:
+            print("reading", flush=True)
+    print("placed", sampler.placed, flush=True)
+    session.close()
+
+
 if __name__ == "__main__":
     if sys.argv[1] == "service":
         serve(sys.argv[2], Path(sys.argv[3]) if len(sys.argv) > 3 else None)
     elif sys.argv[1] == "checked":
         write_checked(sys.argv[2], *map(int, sys.argv[3:]))
+    elif sys.argv[1] == "reader":
+        read(sys.argv[2], int(sys.argv[3]))
     else:
         write(sys.argv[2], *map(int, sys.argv[3:]))
