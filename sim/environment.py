@@ -9,7 +9,9 @@ off-road at t. `progress` (off in the paper's preset) adds the metres gained alo
 logged route, since the paper's reward alone is satisfied by standing still. Metres
 ahead of where the log was at that step count against it, or speeding, tailgating and
 running red lights would pay. All count 1 - (aside / `progress_width`)^2, not below 0,
-where `aside` is the distance from the route.
+where `aside` is the distance from the route. `comfort` (off, too) takes from the reward
+the size of the acceleration, the change of the velocity's vector over the step's
+length, of objects that do not follow the log: braking, throttle and turning alike.
 
 Terminated is what ends the return (a failure, where `terminate` says so); truncated is
 the recording's end, after which there was more to come: only the first has discount 0.
@@ -51,6 +53,8 @@ class EnvironmentConfig:
     """Reward per metre gained along the logged route; 0 is the paper's."""
     progress_width: float = 4.0
     """Distance aside from the route [m] at which progress counts for nothing."""
+    comfort: float = 0.0
+    """Subtracted from the reward per m/s^2 of acceleration; 0 is the paper's."""
     terminate: bool = False
     """Whether a failure (overlap or off-road) ends the episode."""
     dt: float = 0.1
@@ -203,6 +207,10 @@ def advance(
         gained -= _credit(bank, state.scene, state.step, state.controlled, state.along)
         near = jnp.maximum(1.0 - (position.aside / config.progress_width) ** 2, 0.0)
         reward += config.progress * gained * near
+    if config.comfort:
+        changed = now[:, 3:] - state.history[:, -1, 3:]
+        acceleration = jnp.hypot(changed[:, 0], changed[:, 1]) / config.dt
+        reward -= config.comfort * jnp.where(follows, acceleration, 0.0)
     last = step_t >= bank.steps[state.scene] - 1
     following = State(
         scene=state.scene,

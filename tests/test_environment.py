@@ -201,6 +201,16 @@ def test_far_from_the_route_nothing_counts(file) -> None:
     assert float(outcome.reward[0]) == -1.0
 
 
+def test_comfort_costs_the_acceleration_of_what_is_driven(file) -> None:
+    """1 m/s over 0.1 s is 10 m/s^2; the second object is the log's until step 10."""
+    config = EnvironmentConfig(comfort=0.25, overlap_penalty=0.0, offroad_penalty=0.0)
+    state = start(file, GAPS, 0, 1, config=config)
+    for change, cost in (([0.0, 0.0], 0.0), ([0.6, -0.8], 2.5)):
+        moved = np.asarray(state.history[:, -1]) + np.array([0, 0, 0, *change])
+        _, outcome = _advance(file.bank, state, jnp.asarray(moved, "float32"), config)
+        np.testing.assert_allclose(outcome.reward, [-cost, 0.0], atol=1e-5)
+
+
 def test_an_object_that_is_not_recorded_yet_follows_the_log(file) -> None:
     state = start(file, GAPS, 0, 1, 2)
     assert state.history_valid[:, -1].tolist() == [True, False, True]
