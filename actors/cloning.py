@@ -82,6 +82,24 @@ def expert_actions(
     return ExpertActions(*jax.lax.map(one, (states_tm1, states_t), batch_size=_CHUNK))
 
 
+def expert_steps(
+    bank: Bank, controlled: Int[np.ndarray, "scenes controlled"], first: int
+) -> tuple[
+    Int[np.ndarray, " rows"], Int[np.ndarray, " rows"], Int[np.ndarray, " rows"]
+]:
+    """Scene, object and step t of each action, s_tm1 from step `first` on."""
+    there = np.asarray(bank.log_valid)
+    objects_of_log = there.shape[2]
+    steps = np.arange(first, there.shape[1] - 1)
+    scene, slot = np.nonzero(controlled < objects_of_log)
+    objects = controlled[scene, slot]
+    known = there[scene[:, None], :, objects[:, None]][:, 0]
+    lasts = np.asarray(bank.steps)[scene, None]
+    pairs = known[:, steps] & known[:, steps + 1] & (steps[None] + 1 < lasts)
+    which, at = np.nonzero(pairs)
+    return scene[which], objects[which], steps[at] + 1
+
+
 def expert_rows(
     bank: Bank,
     controlled: Int[np.ndarray, "scenes controlled"],
@@ -103,14 +121,7 @@ def expert_rows(
     history = config.observation.history
     log, there = np.asarray(bank.log), np.asarray(bank.log_valid)
     first = history - 1 if first_step is None else first_step
-    steps = np.arange(first, log.shape[1] - 1)
-    scene, slot = np.nonzero(controlled < log.shape[2])
-    objects = controlled[scene, slot]
-    known = there[scene[:, None], :, objects[:, None]][:, 0]
-    lasts = np.asarray(bank.steps)[scene, None]
-    pairs = known[:, steps] & known[:, steps + 1] & (steps[None] + 1 < lasts)
-    which, at = np.nonzero(pairs)
-    scene, objects, step_t = scene[which], objects[which], steps[at] + 1
+    scene, objects, step_t = expert_steps(bank, controlled, first)
     rows = np.zeros(
         len(scene), row_spec(history, len(action_limits(config.action))).dtype
     )

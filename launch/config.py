@@ -23,6 +23,7 @@ from typing import Any, Final, Literal
 import msgspec
 
 from actors.actor import ActorConfig
+from actors.mixture import action_limits
 from actors.network import (
     NetworkConfig,
     laptop_network,
@@ -40,6 +41,10 @@ from sim.observation import ObservationConfig
 
 CONFIG: Final = "config.json"
 FORMAT: Final = 1
+Algorithm = Literal["dqn", "bc"]
+Cloned = Literal["sdc", "vehicles"]  # whose actions: the recording vehicle's, or of all
+FILL_ROWS: Final = 1024  # of a batch by which a bank pass fills the replay
+UNBOUNDED: Final = 1e9  # a limiter's tolerance that no run comes near
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,8 +240,8 @@ class RunFile:
     train_hash: str  # of the bank's content, SHA-256
     held_out_hash: str
     scenes: tuple[str, ...]  # as given on the command line
-    algorithm: Literal["dqn", "bc"] = "dqn"
-    objects: Literal["sdc", "vehicles"] = "vehicles"  # whose actions are cloned
+    algorithm: Algorithm = "dqn"
+    objects: Cloned = "vehicles"
     format: int = FORMAT
 
     @property
@@ -336,6 +341,42 @@ def rows_of_run(config: ExperimentConfig) -> RowSpec:
         n_step=config.learner.n_step,
         others=0 if actor.objects == "sdc" else actor.slots - 1,
     )
+
+
+def with_filled_replay(config: ExperimentConfig, rows: int) -> ExperimentConfig:
+    """The same run with a replay that is filled once with so many rows.
+
+    Nothing is sampled before they are all there, and then without bound, uniformly.
+    Rows beyond them push the oldest out: a bank pass that is made again from its
+    beginning leaves each row once.
+    """
+    replay = dataclasses.replace(
+        config.replay,
+        capacity=rows,
+        min_size=rows,
+        samples_per_insert=1.0,
+        tolerance=UNBOUNDED,
+        sampler="uniform",
+        max_times_sampled=0,
+    )
+    return dataclasses.replace(config, replay=replay)
+
+
+def row_spec_of(run: RunFile) -> RowSpec:
+    """The rows of a run's replay; those of an expert have its continuous actions."""
+    if run.algorithm == "dqn":
+        return rows_of_run(run.config)
+    environment = run.config.environment
+    components = len(action_limits(environment.action))
+    return row_spec(environment.observation.history, components)
+
+
+def batches_of(run: RunFile) -> tuple[int, int]:
+    """Rows of the largest batches that a run inserts and samples."""
+    if run.algorithm == "bc":
+        reply = run.config.learner.batches_per_reply
+        return FILL_ROWS, run.config.cloning.batch_size * reply
+    return largest_batches(run.config)
 
 
 def largest_batches(config: ExperimentConfig) -> tuple[int, int]:

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from launch.config import ExperimentConfig, write_atomically
+from launch.config import UNBOUNDED, ExperimentConfig, write_atomically
 from launch.status import actor_rates
 from launch.supervisor import Supervisor
 from replay.channels import StatusSubscriber, send_stop
@@ -68,7 +68,9 @@ def snapshot(
         "steps": int(stats.get("inserts", 0)),
         "samples": int(stats.get("samples", 0)),
         "samples_per_insert": float(stats.get("samples_per_insert", 0.0)),
-        "configured_samples_per_insert": config.replay.samples_per_insert,
+        "configured_samples_per_insert": config.replay.samples_per_insert
+        if config.replay.tolerance < UNBOUNDED
+        else None,
         "replay_size": int(stats.get("size", 0)),
         "actors": len(actors),
         **actor_rates(fresh),
@@ -119,7 +121,7 @@ def _cells(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         (
             "samples/insert",
             f"{figures['samples_per_insert']:.3f} "
-            f"(of {figures['configured_samples_per_insert']:g})",
+            f"(of {_ratio(figures['configured_samples_per_insert'])})",
         ),
         ("learner waits", percent("learner_waits")),
         ("actors wait", percent("actors_wait")),
@@ -131,6 +133,10 @@ def _cells(figures: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("held out", held_out(figures)),
         ("left", "-" if left is None else f"{left // 60:.0f}:{left % 60:02.0f}"),
     ]
+
+
+def _ratio(asked: float | None) -> str:
+    return "any" if asked is None else f"{asked:g}"
 
 
 def held_out(figures: Mapping[str, Any]) -> str:

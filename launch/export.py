@@ -43,7 +43,7 @@ import msgspec
 import numpy as np
 
 from actors.rows import Columns, columns_of, render
-from launch.config import rows_of_run
+from launch.config import row_spec_of
 from launch.errors import LaunchError
 from launch.join import JoinConfig, Joined, joined, train_bank
 from launch.replay_stats import place_of
@@ -178,7 +178,7 @@ def export_command(options: ExportConfig) -> int:
     )
     partial = options.out.with_name(f".{options.out.name}.partial")
     with joined(join, threading.Event()) as place:
-        spec = rows_of_run(place.run.config)
+        spec = row_spec_of(place.run)
         pages = fetch_rows(
             session=place.session, keys=place.keys, spec=spec, page_rows=_PAGE
         )

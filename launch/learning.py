@@ -267,6 +267,10 @@ def learner_role(join: JoinConfig, stop: threading.Event) -> None:
     """Learns until the budget is spent or it is asked to stop."""
     with joined(join, stop) as place:
         config = place.run.config
+        if place.run.algorithm == "bc":
+            from launch.cloning import clone_from_replay
+
+            return clone_from_replay(place, stop)
         learner = make_learner(config)
         progress = Progress(resume(learner, place.folder))
         statuses = StatusSubscriber(place.session, place.keys)

@@ -174,6 +174,7 @@ COMMANDS: Final = {
     "replay": Command("one role of a run: the replay service", _role),
     "actor": Command("one role of a run: an actor", _role),
     "learner": Command("one role of a run: the learner", _role),
+    "filler": Command("one role of a run: it replays the expert", _role),
     "evaluator": Command("one role of a run: it drives new checkpoints", _role),
     "viewer": Command("one role of a run: the live viewer", _role),
     "doctor": Command("says what works on this machine", _doctor),

@@ -52,6 +52,7 @@ def run_role(name: str, parse: Parse) -> int:
         "replay": _replay,
         "actor": _actor,
         "learner": _learner,
+        "filler": _filler,
         "evaluator": _evaluator,
         "viewer": _viewer,
     }
@@ -81,6 +82,13 @@ def _learner(parse: Parse) -> Act:
     from launch.learning import learner_role
 
     return lambda stop: learner_role(options, stop)
+
+
+def _filler(parse: Parse) -> Act:
+    options = parse(JoinConfig)
+    from launch.cloning import filler_role
+
+    return lambda stop: filler_role(options, stop)
 
 
 def _evaluator(parse: Parse) -> Act:

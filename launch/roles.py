@@ -22,8 +22,9 @@ from actors.network import layout_hash, parameter_layout
 from launch.config import (
     CONFIG,
     ExperimentConfig,
-    largest_batches,
+    batches_of,
     read_run,
+    row_spec_of,
     rows_of_run,
 )
 from launch.errors import LaunchError
@@ -88,11 +89,11 @@ def replay_role(
         ReplayServer(
             session=session,
             keys=keys,
-            spec=rows_of_run(run.config),
+            spec=row_spec_of(run),
             config=replay,
             seed=run.config.seed,
             folder=join.run / REPLAY / str(keys.shard),
-            largest=largest_batches(run.config),
+            largest=batches_of(run),
         ).run(stop)
         offered.close()
         control.close()

@@ -29,6 +29,8 @@ from rich.console import Console
 
 from launch.config import (
     CONFIG,
+    Algorithm,
+    Cloned,
     ExperimentConfig,
     RunFile,
     quick,
@@ -37,7 +39,7 @@ from launch.config import (
     with_environments,
 )
 from launch.converting import say
-from launch.errors import LaunchError
+from launch.errors import INTERRUPTED, LaunchError
 from launch.join import HELD_OUT, SCENES, TRAIN, check_bank
 from launch.scenes import PROCEDURAL, prepare_banks
 from launch.supervisor import Outcome, Result, Role, Supervisor
@@ -97,7 +99,12 @@ def resolved(options: TrainConfig) -> ExperimentConfig:
     return with_environments(config, options.envs)
 
 
-def prepare(options: TrainConfig) -> tuple[Path, RunFile]:
+def prepare(
+    options: TrainConfig,
+    *,
+    algorithm: Algorithm = "dqn",
+    objects: Cloned = "vehicles",
+) -> tuple[Path, RunFile]:
     """Makes the run folder with scenes and configuration, or takes up an old one."""
     folder = folder_of(options)
     if (folder / CONFIG).exists():
@@ -106,7 +113,7 @@ def prepare(options: TrainConfig) -> tuple[Path, RunFile]:
                 f"{folder}: this run exists; go on with it by --resume, or choose "
                 "another folder"
             )
-        return folder, _taken_up(folder, options)
+        return folder, _taken_up(folder, options, algorithm)
     if options.resume:
         raise LaunchError(f"{folder}: no run to resume ({CONFIG} is missing)")
     if folder.exists() and any(folder.iterdir()):
@@ -132,14 +139,21 @@ def prepare(options: TrainConfig) -> tuple[Path, RunFile]:
         train_hash=train.content_hash,
         held_out_hash=held_out.content_hash,
         scenes=options.scenes,
+        algorithm=algorithm,
+        objects=objects,
     )
     run.write(folder)
     return folder, run
 
 
-def _taken_up(folder: Path, options: TrainConfig) -> RunFile:
+def _taken_up(folder: Path, options: TrainConfig, algorithm: Algorithm) -> RunFile:
     """An existing run, with the settings given now, which may lengthen its budget."""
     run = read_run(folder)
+    if run.algorithm != algorithm:
+        raise LaunchError(
+            f"{folder}: a run of train {run.algorithm}; go on with it by slipstream "
+            f"train {run.algorithm} --resume --run {folder}"
+        )
     for name, expected in ((TRAIN, run.train_hash), (HELD_OUT, run.held_out_hash)):
         check_bank(open_bank(folder / SCENES / name), expected)
     config = resolved(options)
@@ -215,8 +229,9 @@ def roles_of(folder: Path, run: RunFile, port: int, placement: Placement) -> lis
                 *placement.listen,
                 *(("--insecure",) if placement.insecure else ()),
             ),
-            # A durable one goes on where it was killed; another has lost its rows.
-            critical=not run.config.replay.durable,
+            # A durable one goes on where it was killed, and an expert's is filled
+            # again; another has lost its rows.
+            critical=not run.config.replay.durable and run.algorithm == "dqn",
             port=port,
         ),
         Role(
@@ -225,7 +240,11 @@ def roles_of(folder: Path, run: RunFile, port: int, placement: Placement) -> lis
             finishes=True,
         ),
     ]
-    for actor in range(run.config.actors - placement.remote_actors):
+    actors = run.config.actors - placement.remote_actors
+    if run.algorithm == "bc":
+        roles.append(Role(name="filler", command=(*command, "filler", *client)))
+        actors = 0
+    for actor in range(actors):
         roles.append(
             Role(
                 name=f"actor-{actor}",
@@ -325,16 +344,24 @@ def train_command(options: TrainConfig) -> int:
     else:
         for line in joining_lines(run, placement):
             say(line)
-        result = asyncio.run(supervise(folder, run, placement=placement))
-        if result.outcome is Outcome.INTERRUPTED:
-            say(
-                f"interrupted; go on with: slipstream train dqn --resume --run {folder}"
-            )
-            return 130
-        if result.outcome is Outcome.FAILED:
-            raise LaunchError(result.reason)
+        if not supervised(folder, run, placement):
+            return INTERRUPTED
     finish(folder, run)
     return 0
+
+
+def supervised(folder: Path, run: RunFile, placement: Placement) -> bool:
+    """Runs the processes; False if a person ended the run before its end."""
+    result = asyncio.run(supervise(folder, run, placement=placement))
+    if result.outcome is Outcome.INTERRUPTED:
+        say(
+            f"interrupted; go on with: slipstream train {run.algorithm} --resume "
+            f"--run {folder}"
+        )
+        return False
+    if result.outcome is Outcome.FAILED:
+        raise LaunchError(result.reason)
+    return True
 
 
 def finish(folder: Path, run: RunFile) -> None:

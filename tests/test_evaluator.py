@@ -203,7 +203,7 @@ def test_all_parameters_share_one_program(tmp_path: Path) -> None:
 @pytest.mark.parametrize("space", ["delta", "bicycle-discrete"])
 def test_the_likelihood_is_the_learners(tmp_path: Path, space: str) -> None:
     """The twin in JAX against the network in torch."""
-    from launch.train_bc import make_cloner, make_render_before
+    from launch.cloning import make_cloner, make_render_before
     from learner.cloning import cloning_batch
 
     file = scenes.bank_of(

@@ -1,25 +1,43 @@
 """`slipstream train bc`: presets, spaces, a run and its resumption."""
 
+import contextlib
 import dataclasses
+import functools
 import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from actors.policy import find_policy, read_policy
+from actors.rows import row_spec
+from launch.cloning import COLUMNS, count_rows
 from launch.config import (
     CLONING_PRESETS,
     BudgetConfig,
+    ExperimentConfig,
     ReportConfig,
     ScenesConfig,
     decode_run,
     paper_cloning,
+    read_run,
+    row_spec_of,
+    with_filled_replay,
     with_space,
 )
+from launch.errors import LaunchError
 from launch.main import main
-from launch.train import TrainConfig, prepare
-from launch.train_bc import COLUMNS, train_bc
+from launch.train import Placement, TrainConfig, prepare, roles_of
+from launch.train_bc import TrainBcConfig, clone_serially, prepare_cloning
 from learner.curves import read_curves
+from replay.local import LocalReplay
+from sim.bank import open_bank
 from sim.dynamics import ActionSpace
 
 
@@ -58,31 +76,150 @@ def test_an_unknown_preset_is_refused(capsys):
     assert "choose one of quick, laptop, paper" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_a_run_goes_on_where_it_ended(tmp_path):
+def tiny(**changes) -> ExperimentConfig:
+    """A run of seconds."""
     config = with_space(CLONING_PRESETS["quick"](), "delta")
-    config = dataclasses.replace(
+    network = dataclasses.replace(config.network, width=16, latents=2, mlp_width=16)
+    return dataclasses.replace(
         config,
-        network=dataclasses.replace(config.network, width=16, mlp_width=16),
+        network=network,
         scenes=ScenesConfig(train=3, held_out=2),
-        budget=BudgetConfig(updates=20),
         report=ReportConfig(tensorboard=False, curves_s=0.01),
+        **changes,
     )
-    options = TrainConfig(run=tmp_path / "run", config=config)
-    folder, run = prepare(options)
+
+
+def options(folder: Path, **changes) -> TrainBcConfig:
+    return TrainBcConfig(space="delta", run=folder, **changes)
+
+
+def test_the_replay_is_filled_once_and_then_drawn_without_bound() -> None:
+    """At the border: the limiter of a real table of 100 rows."""
+    config = with_filled_replay(tiny(), 100)
+    replay = LocalReplay(spec=row_spec(3, 3), config=config.replay, seed=0)
+    rows = np.zeros(60, row_spec(3, 3).dtype)
+    replay.insert(rows)
+    assert not replay.may_sample(1)
+    replay.insert(rows[:39])
+    assert not replay.may_sample(1)
+    replay.insert(rows[:1])
+    for _ in range(20):
+        assert replay.may_sample(4096)
+        replay.sample(4096)
+    # A pass that is made again is let in, and leaves the newest 100.
+    rows["serial"] = np.arange(60)
+    assert replay.may_insert(60)
+    replay.insert(rows)
+    replay.insert(rows[:40])
+    assert replay.size == 100
+    assert np.unique(replay.sample(4096).rows["serial"]).tolist() == list(range(60))
+
+
+def test_a_run_of_one_kind_is_not_resumed_as_the_other(tmp_path: Path) -> None:
+    folder, run = prepare_cloning(options(tmp_path / "run", config=tiny()))
+    assert (run.algorithm, run.mixture) == ("bc", 10)
     assert decode_run((folder / "config.json").read_bytes(), where="x") == run
-    train_bc(folder, run, everyone=True)
+    assert run.config.replay.capacity == count_rows(
+        run, open_bank(folder / "scenes" / "train.bank")
+    )
+    assert row_spec_of(run).dtype["continuous"].shape == (3,)
+    with pytest.raises(LaunchError, match="slipstream train bc --resume"):
+        prepare(TrainConfig(run=folder, resume=True, config=tiny()))
+    with pytest.raises(LaunchError, match="clones --objects vehicles"):
+        again = options(folder, config=tiny(), resume=True, objects="sdc")
+        prepare_cloning(again)
+    names = {role.name for role in roles_of(folder, run, 1, Placement())}
+    assert names == {"replay", "learner", "filler", "evaluator"}
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_where_it_ended(tmp_path: Path) -> None:
+    """In one process."""
+    begun = options(tmp_path / "run", config=tiny(budget=BudgetConfig(updates=20)))
+    folder, run = prepare_cloning(begun)
+    clone_serially(folder, run)
     first = read_policy(folder)
     assert find_policy(folder).parent.parent == folder / "best"
     assert (first.mixture, first.actions) == (10, 70)
-    longer = dataclasses.replace(config, budget=BudgetConfig(updates=60))
-    _, run = prepare(dataclasses.replace(options, resume=True, config=longer))
-    train_bc(folder, run, everyone=True)
+    longer = tiny(budget=BudgetConfig(updates=60))
+    _, run = prepare_cloning(options(folder, config=longer, resume=True))
+    clone_serially(folder, run)
     curves = read_curves(folder / "curves.csv")
     assert set(COLUMNS) <= set(curves)
     assert (np.diff(curves["updates"]) >= 0).all()
     assert curves["updates"][-1] == 60
-    known = curves["log_likelihood"][np.isfinite(curves["log_likelihood"])]
-    assert known[-1] > known[0]
-    kept = json.loads((find_policy(folder).parent / "meta.json").read_text())
-    assert kept["extra"]["log_likelihood"] == pytest.approx(known.max())
+    judged = read_curves(folder / "evaluation.csv")
+    assert judged["updates"].tolist() == [20, 60]
+    assert judged["log_likelihood"][1] > judged["log_likelihood"][0]
+
+
+PATIENCE_S = 240.0
+
+
+def wait_for(process: psutil.Popen, condition: Callable[[], Any], what: str) -> Any:
+    """Waits for something true while the run is alive."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not (value := condition()):
+        assert process.poll() is None, f"the run ended before {what}"
+        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        time.sleep(0.05)
+    return value
+
+
+def role(process: psutil.Popen, name: str) -> psutil.Process | None:
+    """The process of a role, by its command line."""
+    for child in process.children():
+        with contextlib.suppress(psutil.Error):  # of one just killed
+            if name in child.cmdline():
+                return child
+    return None
+
+
+@pytest.mark.slow
+def test_every_process_may_be_killed(tmp_path: Path) -> None:
+    """As a user starts it: what is killed comes back, and the run ends well."""
+    folder = tmp_path / "run"
+    words = (
+        *("--scenes.train", "3", "--scenes.held-out", "2"),
+        *("--network.width", "16", "--network.latents", "2"),
+        *("--report.checkpoint-s", "0.5", "--evaluator.seconds", "0"),
+        *("--cloning.torch-threads", "1", "--cloning.batch-size", "16"),
+        *("--budget.minutes", "0", "--budget.updates", "800"),
+    )
+    process = psutil.Popen(
+        [sys.executable, "-m", "launch", "train", "bc", "--run", folder, *words],
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+    )
+
+    def updates() -> int:
+        latest = folder / "checkpoints" / "latest"
+        return int(latest.read_text()) if latest.exists() else 0
+
+    def judged() -> list[float]:
+        path = folder / "evaluation.csv"
+        return list(read_curves(path)["updates"]) if path.exists() else []
+
+    wait = functools.partial(wait_for, process)
+    try:
+        wait(lambda: updates() > 0, "a checkpoint")
+        wait(judged, "an evaluation")
+        for name in ("replay", "filler", "evaluator", "learner"):
+            wait(functools.partial(role, process, name), name).kill()
+        seen, before = updates(), len(judged())
+        wait(lambda: updates() > seen, "the learner's return")
+        wait(lambda: len(judged()) > before, "the evaluator's return")
+        assert process.wait(PATIENCE_S) == 0
+    finally:
+        with contextlib.suppress(psutil.Error):
+            process.kill()
+        process.wait()
+    status = json.loads((folder / "status.json").read_text())
+    assert set(status["restarts"].values()) == {1}
+    assert status["replay"]["size"] == read_run(folder).config.replay.capacity
+    steps = judged()
+    assert steps == sorted(set(steps)) and steps[-1] == updates() == 800
+    assert json.loads((folder / "evaluation.json").read_text())["agents"]
+    best = json.loads((find_policy(folder).parent / "judged.json").read_text())
+    known = read_curves(folder / "evaluation.csv")
+    assert best["failure_rate"] == known["failure_rate"].min()

@@ -1,0 +1,284 @@
+"""Behaviour cloning's roles: the filler replays the expert, the learner clones it.
+
+The filler makes a row of every action that the log holds (`actors.cloning`) and inserts
+them over Zenoh as an actor does, once; the replay then lets the learner draw uniformly
+and without bound (`launch.config.with_filled_replay`). It stays, and fills again a
+replay that was killed and has come back empty. A filler that is started again makes
+its pass from the beginning: rows of the pass before are pushed out, the oldest first,
+and when it ends each row is there once.
+
+    RUN/curves.csv           loss, updates per second, shares of time
+        checkpoints/         the newest
+"""
+
+import dataclasses
+import functools
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, final
+
+import jax
+import numpy as np
+
+from actors.cloning import expert_rows, expert_steps, moving_vehicles, sdc_only
+from actors.rows import columns_of, render_before
+from launch.config import FILL_ROWS, ExperimentConfig, RunFile, row_spec_of
+from launch.errors import LaunchError
+from launch.join import JoinConfig, Joined, joined, train_bank
+from launch.learning import CHECKPOINTS, CURVES, TENSORBOARD, checkpoint_extra, spent
+from launch.status import STATUS_S
+from learner.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
+from learner.cloning import CloneStep, CloningLearner, clone
+from learner.curves import CurvesWriter
+from replay.channels import StatusPublisher
+from replay.client import ReplayTimeout, Sampler, Writer, fetch_stats
+from sim.bank import Bank, BankFile
+from sim.observation import Observation, observation_sizes
+
+COLUMNS: Final = (
+    "loss",
+    "updates_per_s",
+    "waited_share",
+    "rendered_share",
+    "seconds",
+)
+_WAIT_S: Final = 0.5  # between two looks at the reasons to stop
+_FLUSH_S: Final = 30.0
+Render = Callable[[np.ndarray], Observation]
+
+
+def controlled_of(run: RunFile, bank: Bank) -> np.ndarray:
+    """Whose actions are cloned: [scenes, slots] rows of the log."""
+    return moving_vehicles(bank) if run.objects == "vehicles" else sdc_only(bank)
+
+
+def count_rows(run: RunFile, file: BankFile) -> int:
+    """How many actions there are to clone."""
+    # On the file's own arrays: the process that counts starts others, and must not
+    # have JAX's threads when it does.
+    arrays: Any = file.arrays
+    bank = Bank(**arrays)
+    first = run.config.environment.observation.history - 1
+    return len(expert_steps(bank, controlled_of(run, bank), first)[0])
+
+
+def rows_to_clone(run: RunFile, bank: Bank) -> np.ndarray:
+    """The bank pass: a row for each of the expert's actions."""
+    return expert_rows(bank, controlled_of(run, bank), run.config.environment)
+
+
+def make_cloner(config: ExperimentConfig) -> CloningLearner:
+    """The learner of a run, with the run's seed."""
+    return CloningLearner(
+        config=dataclasses.replace(config.cloning, seed=config.seed),
+        network=config.network,
+        sizes=observation_sizes(config.environment.observation),
+        action=config.environment.action,
+    )
+
+
+def make_render_before(file: BankFile, config: ExperimentConfig) -> Render:
+    """Rows to the observations where actions were chosen, compiled."""
+    observation = config.environment.observation
+    compiled = jax.jit(functools.partial(render_before, config=observation))
+    return lambda rows: compiled(file.bank, columns_of(rows))
+
+
+def resume_cloning(learner: CloningLearner, folder: Path) -> float:
+    """Restores the run's newest checkpoint, if any; the seconds it had taken."""
+    if latest_checkpoint(folder / CHECKPOINTS) is None:
+        return 0.0
+    meta = load_checkpoint(folder / CHECKPOINTS, learner=learner)
+    return float(meta["extra"]["elapsed_s"])
+
+
+@final
+class CloneReporter:
+    """Status every second, curves every few, a checkpoint now and then."""
+
+    def __init__(
+        self,
+        *,
+        learner: CloningLearner,
+        config: ExperimentConfig,
+        folder: Path,
+        before_s: float,
+        tell: Callable[[dict[str, float | int | str]], object] = lambda told: None,
+        saved: Callable[[], object] = lambda: None,
+    ) -> None:
+        """Opens the curves; `before_s` was spent before this process began.
+
+        `saved` is called after each checkpoint.
+        """
+        report = config.report
+        self._learner = learner
+        self._config = config
+        self._folder = folder
+        self._before_s = before_s
+        self._tell = tell
+        self._saved = saved
+        self._began: float | None = None
+        self._steps: list[CloneStep] = []
+        self._seen: dict[str, float] = {}
+        self._curves = CurvesWriter(
+            csv_path=folder / CURVES,
+            tensorboard=folder / TENSORBOARD if report.tensorboard else None,
+            columns=COLUMNS,
+            resume_from=learner.updates,
+        )
+        now = time.monotonic()
+        self._written = self._status_due = now
+        self._checkpoint_due = now + report.checkpoint_s
+
+    @property
+    def elapsed_s(self) -> float:
+        """Since the first update, over all restarts."""
+        running = 0.0 if self._began is None else time.monotonic() - self._began
+        return self._before_s + running
+
+    def add(self, step: CloneStep) -> None:
+        """Counts one update."""
+        if self._began is None:
+            # Waiting for the replay to fill is no part of the budget, nor compiling.
+            self._began = self._written = time.monotonic()
+            return
+        self._steps.append(step)
+
+    def look(self) -> None:
+        """Writes what is due."""
+        now = time.monotonic()
+        if now >= self._written + self._config.report.curves_s:
+            self.write()
+        if now >= self._status_due:
+            self._status_due = now + STATUS_S
+            self._tell(
+                {
+                    "updates": self._learner.updates,
+                    "elapsed_s": self.elapsed_s,
+                    **self._seen,
+                }
+            )
+        if now >= self._checkpoint_due:
+            self.save()
+            self._checkpoint_due = time.monotonic() + self._config.report.checkpoint_s
+
+    def write(self) -> None:
+        """One row of the averages since the last, where there was an update since."""
+        wall = max(time.monotonic() - self._written, 1e-9)
+        steps, self._steps, self._written = self._steps, [], time.monotonic()
+        if not steps:
+            return
+        self._seen = {
+            "loss": float(np.mean([step.result.loss for step in steps])),
+            "updates_per_s": len(steps) / wall,
+            "waited_share": sum(step.waited_s for step in steps) / wall,
+            "rendered_share": sum(step.rendered_s for step in steps) / wall,
+        }
+        values = self._seen | {"seconds": self.elapsed_s}
+        self._curves.write(self._learner.updates, values)
+
+    def save(self) -> None:
+        """Writes a checkpoint."""
+        save_checkpoint(
+            self._folder / CHECKPOINTS,
+            learner=self._learner,
+            extra=checkpoint_extra(self._config, self.elapsed_s, {}),
+            keep=self._config.report.checkpoints,
+        )
+        self._saved()
+
+    def close(self) -> None:
+        """The last row and checkpoint."""
+        self.write()
+        self.save()
+        self._curves.close()
+
+
+def clone_from_replay(place: Joined, stop: threading.Event) -> None:
+    """The learner's role: clones until the budget is spent or it is asked to stop."""
+    config = place.run.config
+    learner = make_cloner(config)
+    reporter = CloneReporter(
+        learner=learner,
+        config=config,
+        folder=place.folder,
+        before_s=resume_cloning(learner, place.folder),
+        tell=StatusPublisher(place.session, place.keys, "learner").put,
+    )
+    sampler = Sampler(
+        session=place.session,
+        keys=place.keys,
+        spec=row_spec_of(place.run),
+        batch_size=config.cloning.batch_size,
+        batches_per_reply=config.learner.batches_per_reply,
+        in_flight=2,
+    )
+
+    def sample() -> np.ndarray | None:
+        try:
+            return sampler.sample(_WAIT_S).rows
+        except ReplayTimeout:
+            return None
+
+    render = make_render_before(train_bank(place), config)
+    for step in clone(learner=learner, sample=sample, render=render):
+        if step is not None:
+            reporter.add(step)
+        reporter.look()
+        over = spent(config, learner.updates, reporter.elapsed_s)
+        if over or stop.is_set():
+            break
+    reporter.close()
+
+
+def filler_role(join: JoinConfig, stop: threading.Event) -> None:
+    """Fills the replay, and again whenever it has lost rows, until asked to stop."""
+    with joined(join, stop) as place:
+        rows = rows_to_clone(place.run, train_bank(place).bank)
+        if len(rows) != place.run.config.replay.capacity:
+            raise LaunchError(
+                f"{place.folder}: the bank has {len(rows)} actions to clone, the "
+                f"replay room for {place.run.config.replay.capacity}; start the run by "
+                "slipstream train bc"
+            )
+        status = StatusPublisher(place.session, place.keys, "filler")
+        filled = False
+        while not stop.is_set():
+            if not filled:
+                filled = _fill(place, rows, stop)
+            status.put({"rows": len(rows) if filled else 0})
+            stop.wait(STATUS_S)
+            filled = filled and not _lost(place, len(rows))
+
+
+def _fill(place: Joined, rows: np.ndarray, stop: threading.Event) -> bool:
+    """Inserts every row; False if it was asked to stop before the end."""
+    writer = Writer(
+        session=place.session,
+        keys=place.keys,
+        spec=row_spec_of(place.run),
+        writer=0,
+        # In milliseconds: it grows from one pass to the next.
+        epoch=time.time_ns() // 1_000_000,
+        window=place.run.config.actor.window,
+        batch_rows=FILL_ROWS,
+    )
+    for first in range(0, len(rows), FILL_ROWS):
+        part = rows[first : first + FILL_ROWS]
+        # A part is one batch, so what did not fit is whole and offered again.
+        while not writer.append(part, _WAIT_S) and not stop.is_set():
+            part = part[:0]
+        if stop.is_set():
+            break
+    acknowledged = writer.close(_WAIT_S if stop.is_set() else _FLUSH_S)
+    return acknowledged and not stop.is_set()
+
+
+def _lost(place: Joined, count: int) -> bool:
+    """Whether the service says that it has fewer rows."""
+    try:
+        return bool(fetch_stats(place.session, place.keys)["size"] < count)
+    except ReplayTimeout:
+        return False  # it is being started again: asked once more in a while
