@@ -152,6 +152,15 @@ def _export(words: list[str], prog: str) -> int:
     return export_command(_parse(ExportConfig, words, prog))
 
 
+def _sweep(words: list[str], prog: str) -> int:
+    from launch.sweep import SweepConfig, sweep_command
+
+    # What follows `--` is not the sweep's: each run gets it.
+    cut = words.index("--") if "--" in words else len(words)
+    options = _parse(SweepConfig, words[:cut], prog)
+    return sweep_command(prog.rsplit(" ", 1)[1], options, words[cut + 1 :])
+
+
 def _role(words: list[str], prog: str) -> int:
     from launch.processes import run_role
 
@@ -169,6 +178,9 @@ COMMANDS: Final = {
     "view": Command("shows a run in progress or a recording", _view),
     "bench sim": Command("measures the simulator", _sim),
     "bench pipeline": Command("measures a run of the quick preset", _pipeline),
+    "sweep bc": Command("clones at each point of the paper's grid", _sweep),
+    "sweep dqn": Command("trains double DQN at each point of the grid", _sweep),
+    "sweep all": Command("both grids, and one table of both", _sweep),
     "replay stats": Command("says how a run's replay fares", _replay_stats),
     "replay export": Command("writes a replay to a file for offline RL", _export),
     "replay": Command("one role of a run: the replay service", _role),

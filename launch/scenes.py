@@ -6,6 +6,7 @@ generated. What a folder holds besides scenes is passed over with a word.
 
 import dataclasses
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -121,7 +122,7 @@ def _tell_left_out(tally: Tally) -> None:
 def _given(
     banks: Sequence[Path], paths: Sequence[Path], train: Path, held_out: Path
 ) -> tuple[BankFile, BankFile]:
-    """Banks of the user's: copied, so that the run folder is whole."""
+    """Banks of the user's, in the run folder too, so that it is whole."""
     if len(banks) != len(paths) or len(banks) > 2:
         raise LaunchError(
             f"{banks[0]}: is a bank; give --scenes one bank, or two: the second one is "
@@ -130,9 +131,20 @@ def _given(
     for path in banks:
         open_bank(path)
     train.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(banks[0], train)
-    shutil.copyfile(banks[-1], held_out)
+    _place(banks[0], train)
+    _place(banks[-1], held_out)
     return open_bank(train), open_bank(held_out)
+
+
+def _place(bank: Path, to: Path) -> None:
+    """Links a bank, or copies it: banks are written beside and renamed, never changed.
+
+    The runs of a sweep share a bank of gigabytes.
+    """
+    try:
+        os.link(bank, to)
+    except OSError:
+        shutil.copyfile(bank, to)
 
 
 def bank_of(

@@ -198,7 +198,7 @@ class Supervisor:
         self._tell_reaper(f"+{process.pid}")
         code = await process.wait()
         del self._processes[role.name]
-        _signal_group(process.pid, signal.SIGKILL)  # what it may have left
+        signal_group(process.pid, signal.SIGKILL)  # what it may have left
         self._tell_reaper(f"-{process.pid}")
         return code
 
@@ -209,7 +209,7 @@ class Supervisor:
         await asyncio.gather(*self._keepers, return_exceptions=True)
         waits = [asyncio.create_task(p.wait()) for p in self._processes.values()]
         for process in self._processes.values():
-            _signal_group(process.pid, signal.SIGTERM)
+            signal_group(process.pid, signal.SIGTERM)
         ended = asyncio.gather(*waits)
         hurry = asyncio.create_task(self._hurry.wait())
         either: list[asyncio.Future[Any]] = [ended, hurry]
@@ -220,7 +220,7 @@ class Supervisor:
         for name, process in self._processes.items():
             if process.returncode is None:
                 self._on_event(f"{name} did not end when asked to: killed")
-            _signal_group(process.pid, signal.SIGKILL)
+            signal_group(process.pid, signal.SIGKILL)
         await ended
         self._processes.clear()
         assert self._reaper is not None and self._reaper.stdin is not None
@@ -249,7 +249,7 @@ def _describe(code: int) -> str:
     return f"was ended by {signal.Signals(-code).name}"
 
 
-def _signal_group(group: int, number: signal.Signals) -> None:
+def signal_group(group: int, number: signal.Signals) -> None:
     """Signals a process group that may be gone."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(group, number)
