@@ -225,6 +225,8 @@ def plot_curves(path: Path, points: Sequence[Point], runs: Sequence[Path]) -> No
             if point.algorithm == algorithm
         ]
         for across, (name, title) in enumerate(CURVES):
+            if not any(name in curve for _, curve in shown):
+                continue  # DQN has no likelihood
             place = down * len(CURVES) + across + 1
             axes = figure.add_subplot(len(algorithms), len(CURVES), place)
             for point, curve in shown:
