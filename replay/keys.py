@@ -2,8 +2,8 @@
 
 A key expression is a path of chunks; `*` stands for one chunk, `**` for any number.
 All keys of a run lie below `slipstream/<run_id>/`, so that one access rule covers it.
-The shard's number is part of the replay keys although there is one shard today:
-writers are to be spread over several later without a change of key space.
+A shard's number is part of its replay keys. What a shard says of itself (claim, life)
+ends in the number of its process, so that two lives of one shard are two keys.
 """
 
 import re
@@ -66,6 +66,29 @@ class RunKeys:
     def sync(self) -> str:
         """Queries that are answered once all rows of now are on the disk."""
         return f"slipstream/{self.run_id}/replay/{self.shard}/sync"
+
+    @property
+    def claims(self) -> str:
+        """Liveliness of whoever serves this shard, or is about to."""
+        return f"slipstream/{self.run_id}/claims/{self.shard}/*"
+
+    def claim(self, incarnation: int) -> str:
+        """The process `incarnation` claims this shard."""
+        return f"slipstream/{self.run_id}/claims/{self.shard}/{incarnation:x}"
+
+    @property
+    def lives(self) -> str:
+        """Liveliness of this shard's service."""
+        return f"slipstream/{self.run_id}/shards/{self.shard}/*"
+
+    @property
+    def all_lives(self) -> str:
+        """Liveliness of all shards' services."""
+        return f"slipstream/{self.run_id}/shards/*/*"
+
+    def life(self, incarnation: int) -> str:
+        """The process `incarnation` serves this shard; it says how to be reached."""
+        return f"slipstream/{self.run_id}/shards/{self.shard}/{incarnation:x}"
 
     @property
     def weights(self) -> str:

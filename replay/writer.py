@@ -108,6 +108,11 @@ class Writer:
         return self._waited_s
 
     @property
+    def room(self) -> int:
+        """Rows until the batch under way is full, and has to fit into the window."""
+        return len(self._partial) - self._filled
+
+    @property
     def resent(self) -> int:
         """How often the writer went back."""
         return self._resent
