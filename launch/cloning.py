@@ -33,7 +33,10 @@ from learner.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoi
 from learner.cloning import CloneStep, CloningLearner, clone
 from learner.curves import CurvesWriter
 from replay.channels import StatusPublisher
-from replay.client import ReplayTimeout, Sampler, Writer, fetch_stats
+from replay.client import ReplayTimeout, Writer
+from replay.shards_directory import ShardDirectory
+from replay.shards_sampler import ShardedSampler
+from replay.shards_tools import fetch_all_stats
 from sim.bank import Bank, BankFile
 from sim.observation import Observation, observation_sizes
 
@@ -207,13 +210,15 @@ def clone_from_replay(place: Joined, stop: threading.Event) -> None:
         before_s=resume_cloning(learner, place.folder),
         tell=StatusPublisher(place.session, place.keys, "learner").put,
     )
-    sampler = Sampler(
-        session=place.session,
-        keys=place.keys,
-        spec=row_spec_of(place.run),
+    spec = row_spec_of(place.run)
+    directory = place.directory(spec)
+    sampler = ShardedSampler(
+        directory=directory,
+        spec=spec,
         batch_size=config.cloning.batch_size,
-        batches_per_reply=config.learner.batches_per_reply,
+        batches_per_reply=max(1, config.learner.batches_per_reply // config.shards),
         in_flight=2,
+        seed=config.seed,
     )
 
     def sample() -> np.ndarray | None:
@@ -231,6 +236,7 @@ def clone_from_replay(place: Joined, stop: threading.Event) -> None:
         if over or stop.is_set():
             break
     reporter.close()
+    directory.close()
 
 
 def filler_role(join: JoinConfig, stop: threading.Event) -> None:
@@ -244,41 +250,65 @@ def filler_role(join: JoinConfig, stop: threading.Event) -> None:
                 "slipstream train bc"
             )
         status = StatusPublisher(place.session, place.keys, "filler")
-        filled = False
+        directory = place.directory(row_spec_of(place.run))
+        parts = _dealt(rows, place.run.config.shards)
         while not stop.is_set():
-            if not filled:
-                filled = _fill(place, rows, stop)
-            status.put({"rows": len(rows) if filled else 0})
+            lacking = _lacking(place, parts)
+            if lacking:
+                _fill(place, directory, lacking, stop)
+            status.put({"rows": len(rows) if lacking == {} else 0})
             stop.wait(STATUS_S)
-            filled = filled and not _lost(place, len(rows))
+        directory.close()
 
 
-def _fill(place: Joined, rows: np.ndarray, stop: threading.Event) -> bool:
-    """Inserts every row; False if it was asked to stop before the end."""
-    writer = Writer(
-        session=place.session,
-        keys=place.keys,
-        spec=row_spec_of(place.run),
-        writer=0,
-        # In milliseconds: it grows from one pass to the next.
-        epoch=time.time_ns() // 1_000_000,
-        window=place.run.config.actor.window,
-        batch_rows=FILL_ROWS,
-    )
-    for first in range(0, len(rows), FILL_ROWS):
-        part = rows[first : first + FILL_ROWS]
-        # A part is one batch, so what did not fit is whole and offered again.
-        while not writer.append(part, _WAIT_S) and not stop.is_set():
-            part = part[:0]
+def _dealt(rows: np.ndarray, shards: int) -> dict[int, np.ndarray]:
+    """What each shard holds of the pass: as many rows, one scene's in all of them."""
+    return {shard: rows[shard::shards] for shard in range(shards)}
+
+
+def _fill(
+    place: Joined,
+    directory: ShardDirectory,
+    parts: dict[int, np.ndarray],
+    stop: threading.Event,
+) -> None:
+    """Inserts the shards' rows, in turns, so that they are full at the same time."""
+    writers = {
+        link.shard: Writer(
+            session=link.session,
+            keys=link.keys,
+            spec=row_spec_of(place.run),
+            writer=0,
+            # In milliseconds: it grows from one pass to the next.
+            epoch=time.time_ns() // 1_000_000,
+            window=place.run.config.actor.window,
+            batch_rows=FILL_ROWS,
+        )
+        for link in directory.links
+        if link.shard in parts
+    }
+    for first in range(0, max(map(len, parts.values())), FILL_ROWS):
+        for shard, writer in writers.items():
+            part = parts[shard][first : first + FILL_ROWS]
+            # A part is one batch, so what did not fit is whole and offered again.
+            while not writer.append(part, _WAIT_S) and not stop.is_set():
+                part = part[:0]
         if stop.is_set():
             break
-    acknowledged = writer.close(_WAIT_S if stop.is_set() else _FLUSH_S)
-    return acknowledged and not stop.is_set()
+    for writer in writers.values():
+        writer.close(_WAIT_S if stop.is_set() else _FLUSH_S)
 
 
-def _lost(place: Joined, count: int) -> bool:
-    """Whether the service says that it has fewer rows."""
+def _lacking(
+    place: Joined, parts: dict[int, np.ndarray]
+) -> dict[int, np.ndarray] | None:
+    """The parts of which a shard that is up has not every row; None: no answer."""
     try:
-        return bool(fetch_stats(place.session, place.keys)["size"] < count)
+        stats = fetch_all_stats(place.session, place.keys)
     except ReplayTimeout:
-        return False  # it is being started again: asked once more in a while
+        return None  # it is being started again: asked once more in a while
+    return {
+        shard: rows
+        for shard, rows in parts.items()
+        if shard in stats and stats[shard]["size"] < len(rows)
+    }

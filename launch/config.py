@@ -141,6 +141,8 @@ class ExperimentConfig:
     """Which checkpoints are driven on held-out scenes while the run goes on."""
     actors: int = 2
     """Actor processes."""
+    shards: int = 1
+    """Replay services; the replay's capacity and min_size are of all together."""
     seed: int = 0
     """Of everything random but the scenes: weights, exploration, draws."""
 
@@ -148,8 +150,12 @@ class ExperimentConfig:
         """Refuses a run without actors, and one whose two sides wait for each other."""
         if self.actors < 1:
             raise ValueError(f"actors={self.actors} must be at least 1")
+        if not 1 <= self.shards <= min(256, self.replay.min_size):
+            raise ValueError(
+                f"shards={self.shards} must be 1 to {min(256, self.replay.min_size)}"
+            )
         insert_rows, sample_rows = largest_batches(self)
-        self.replay.limiter().check_batches(
+        shard_replay(self).limiter().check_batches(
             insert_rows=insert_rows, sample_rows=sample_rows
         )
 
@@ -377,6 +383,22 @@ def batches_of(run: RunFile) -> tuple[int, int]:
         reply = run.config.learner.batches_per_reply
         return FILL_ROWS, run.config.cloning.batch_size * reply
     return largest_batches(run.config)
+
+
+def shard_replay(config: ExperimentConfig) -> ReplayConfig:
+    """The settings of one of the run's shards.
+
+    Capacity and minimum are shared out. The limiter's tolerance, in samples, is not:
+    each shard has to let the same batches pass as one table would.
+    """
+    replay, shards = config.replay, config.shards
+    min_size = max(1, replay.min_size // shards)
+    return dataclasses.replace(
+        replay,
+        capacity=-(-replay.capacity // shards),
+        min_size=min_size,
+        tolerance=replay.tolerance * replay.min_size / min_size,
+    )
 
 
 def largest_batches(config: ExperimentConfig) -> tuple[int, int]:

@@ -22,15 +22,19 @@ from launch.config import UNBOUNDED, ExperimentConfig, write_atomically
 from launch.status import actor_rates
 from launch.supervisor import Supervisor
 from replay.channels import StatusSubscriber, send_stop
-from replay.client import fetch_stats
 from replay.keys import RunKeys
 from replay.session import ConnectError, open_session
+from replay.shards_tools import fetch_all_stats, total
 from replay.spec import ReplayError
 
 if TYPE_CHECKING:
     import zenoh
 
 STATUS: Final = "status.json"
+_OF_A_SHARD: Final = (
+    *("size", "inserts", "samples", "samples_per_insert", "insert_rate"),
+    *("sample_rate", "debt", "incarnation"),
+)
 _TERMINAL_S: Final = 1.0  # between two refreshes
 _PLAIN_S: Final = 10.0  # between two lines where nobody looks at a screen
 _STALE_S: Final = 30.0  # a role silent for longer does not count
@@ -161,6 +165,15 @@ def line_of(figures: Mapping[str, Any]) -> str:
     return "  ".join(f"{heading} {value}" for heading, value in _cells(figures))
 
 
+def shard_line(told: Mapping[str, Any]) -> str:
+    """A shard's figures in one line."""
+    return (
+        f"{told['size']:,} rows  {told['insert_rate']:,.0f} inserts/s  "
+        f"{told['sample_rate']:,.0f} samples/s  {told['samples_per_insert']:.3f} "
+        "samples/insert"
+    )
+
+
 @final
 class RunConsole:
     """Follows a run that a supervisor runs."""
@@ -187,7 +200,8 @@ class RunConsole:
         self._session: zenoh.Session | None = None
         self._statuses: StatusSubscriber | None = None
         self._rate = _Rate()
-        self._stats: dict[str, Any] = {}
+        self._stats: dict[str, Any] = {}  # of all shards together
+        self._shards: dict[int, dict[str, Any]] = {}
         self.figures: dict[str, Any] = {}
         """What was shown last."""
 
@@ -240,9 +254,10 @@ class RunConsole:
     async def _look(self) -> None:
         assert self._session is not None and self._statuses is not None
         try:
-            self._stats = await asyncio.to_thread(
-                fetch_stats, self._session, self._keys, timeout=1.0
+            self._shards = await asyncio.to_thread(
+                fetch_all_stats, self._session, self._keys, timeout=1.0
             )
+            self._stats = total(self._shards)
         except ReplayError:
             pass  # not up yet, or busy: the last counters stand
         now = time.monotonic()
@@ -250,6 +265,10 @@ class RunConsole:
         figures = snapshot(self._config, roles, self._stats, now)
         figures["steps_per_s"] = self._rate.add(now, figures["steps"])
         figures["looked_s"] = now
+        figures["shards"] = {
+            str(shard): {name: told[name] for name in _OF_A_SHARD}
+            for shard, told in self._shards.items()
+        }
         figures["restarts"] = sum(self._supervisor.restarts.values())
         figures["cpu"] = self._processors()
         figures["roles"] = {name: dict(values) for name, (_, values) in roles.items()}
@@ -275,6 +294,9 @@ class RunConsole:
             table.add_row(heading, value)
         shares = self.figures["cpu"].items()
         table.add_row("cores", "  ".join(f"{n} {share:.2f}" for n, share in shares))
+        shards = self.figures["shards"]
+        for shard, told in shards.items() if self._config.shards > 1 else ():
+            table.add_row(f"shard {shard}", shard_line(told))
         if self.figures["restarts"]:
             table.add_row("restarts", str(self.figures["restarts"]))
         return table

@@ -9,10 +9,11 @@ The layout that offline-RL libraries load (`d4rl.qlearning_dataset`, CORL, d3rlp
     terminals          bool    [N]      s_t is terminal (discount 0)
     timeouts           bool    [N]      s_t is the last recorded step of its scene
     infos/NAME         [N, ...]         the row's own fields: scene, step, ...
-    infos/id           uint64  [N]      order of insertion
+    infos/id           uint64  [N]      order of insertion; shard x 2^48 + its own order
 
 Rows of several actors and environments lie mixed, in the order in which they were
-inserted, so s_t is given and not to be taken from the next row.
+inserted, one shard of the replay after the other, so s_t is given and not to be taken
+from the next row.
 
 Rows hold states. Observations are rendered from them and the run's scenes by the
 function that the actor acted on (`actors.rows.render`), so D and the meaning of each
@@ -29,6 +30,7 @@ Minari's layout was rejected: it needs whole episodes, which a replay that has p
 rows out does not have. Parquet was too: none of those libraries reads it.
 """
 
+import dataclasses
 import functools
 import json
 import os
@@ -48,7 +50,9 @@ from launch.errors import LaunchError
 from launch.join import JoinConfig, Joined, joined, train_bank
 from launch.replay_stats import place_of
 from replay.client import fetch_rows
-from replay.spec import Sample
+from replay.keys import RunKeys
+from replay.shards import global_ids, live_shards
+from replay.spec import RowSpec, Sample
 from sim.bank import Bank
 from sim.observation import Observation, ObservationConfig
 
@@ -164,6 +168,18 @@ def write(file: Any, pages: Iterator[Sample], place: Joined, observe: bool) -> i
     return count
 
 
+def all_pages(place: Joined, spec: RowSpec) -> Iterator[Sample]:
+    """Every row of every shard that is up, under its id in the run."""
+    for shard in live_shards(place.session, place.keys):
+        for page in fetch_rows(
+            session=place.session,
+            keys=RunKeys(place.keys.run_id, shard),
+            spec=spec,
+            page_rows=_PAGE,
+        ):
+            yield dataclasses.replace(page, ids=global_ids(page.ids, shard))
+
+
 def export_command(options: ExportConfig) -> int:
     """`slipstream replay export`; the exit code."""
     try:
@@ -179,9 +195,7 @@ def export_command(options: ExportConfig) -> int:
     partial = options.out.with_name(f".{options.out.name}.partial")
     with joined(join, threading.Event()) as place:
         spec = row_spec_of(place.run)
-        pages = fetch_rows(
-            session=place.session, keys=place.keys, spec=spec, page_rows=_PAGE
-        )
+        pages = all_pages(place, spec)
         try:
             with h5py.File(partial, "w") as file:
                 count = write(file, pages, place, options.observations)

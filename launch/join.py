@@ -6,6 +6,7 @@ keeps in the user's cache for the next time. A bank of another hash is refused.
 """
 
 import os
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -20,6 +21,8 @@ from replay.channels import ControlSubscriber
 from replay.files import FileError, fetch_file
 from replay.keys import RunKeys
 from replay.session import check_endpoints, open_session
+from replay.shards_directory import ShardDirectory
+from replay.spec import RowSpec
 from sim.bank import BankFile, open_bank
 
 if TYPE_CHECKING:
@@ -41,11 +44,23 @@ class JoinConfig:
     connect: tuple[str, ...] = ()
     """Endpoints to connect to, e.g. tcp/127.0.0.1:7447."""
     listen: tuple[str, ...] = ()
-    """Endpoints to listen on; the replay service needs one."""
+    """Endpoints to listen on; the replay's hub, shard 0, needs one."""
     insecure: bool = False
     """Allows addresses other than loopback; nothing is encrypted."""
     run: Path | None = None
     """The run's folder, where this machine has it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardConfig:
+    """Which part of the replay a process serves."""
+
+    shard: int = 0
+    """The shard's number; 0 is the hub, to which all others and all roles connect."""
+    announce: tuple[str, ...] = ()
+    """Endpoints by which others reach this shard; unless given, those of --listen."""
+    durable: bool = False
+    """Keeps the rows in the run's folder, whatever its configuration says."""
 
 
 @final
@@ -57,6 +72,28 @@ class Joined:
     keys: RunKeys
     run: RunFile
     folder: Path  # the run's, or the cache's
+    hub: tuple[str, ...]  # endpoints by which it is reached
+    insecure: bool
+
+    def directory(
+        self, spec: RowSpec, *, wanted: tuple[int, ...] | None = None
+    ) -> ShardDirectory:
+        """The run's shards; `wanted`: those to be linked to, unless given all."""
+        return ShardDirectory(
+            session=self.session,
+            keys=self.keys,
+            spec=spec,
+            hub=self.hub,
+            insecure=self.insecure,
+            wanted=wanted,
+        )
+
+
+def free_port() -> int:
+    """A port of loopback that nothing listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 @contextmanager
@@ -78,7 +115,14 @@ def joined(join: JoinConfig, stop: threading.Event) -> Iterator[Joined]:
                 f"{folder}: holds the run {run.run_id}, not {join.run_id}; name "
                 "another folder with --run"
             )
-        yield Joined(session=session, keys=keys, run=run, folder=folder)
+        yield Joined(
+            session=session,
+            keys=keys,
+            run=run,
+            folder=folder,
+            hub=join.connect,
+            insecure=join.insecure,
+        )
 
 
 def _fetch(session: "zenoh.Session", keys: RunKeys, name: str, to: Path) -> None:

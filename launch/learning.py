@@ -26,7 +26,9 @@ from learner.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoi
 from learner.curves import CurvesWriter
 from learner.learner import Learner, LearnStep, learn
 from replay.channels import StatusPublisher, StatusSubscriber
-from replay.client import ReplayTimeout, Sampler, fetch_stats, sync_replay
+from replay.client import ReplayTimeout
+from replay.shards_sampler import ShardedSampler
+from replay.shards_tools import fetch_all_stats, sync_all, total
 from replay.spec import Sample
 from replay.weights import WeightsPublisher
 from sim.bank import Bank
@@ -285,13 +287,16 @@ def learner_role(join: JoinConfig, stop: threading.Event) -> None:
         )
         publisher = WeightsPublisher(session=place.session, keys=place.keys)
         layout = layout_hash(learner.layout)
-        sampler = Sampler(
-            session=place.session,
-            keys=place.keys,
-            spec=rows_of_run(config),
+        spec = rows_of_run(config)
+        directory = place.directory(spec)
+        sampler = ShardedSampler(
+            directory=directory,
+            spec=spec,
             batch_size=config.learner.batch_size,
-            batches_per_reply=config.learner.batches_per_reply,
+            # With so many shards, as many rows are under way in all as with one.
+            batches_per_reply=max(1, config.learner.batches_per_reply // config.shards),
             in_flight=2,
+            seed=config.seed,
         )
         steps = learn(
             learner=learner,
@@ -309,9 +314,10 @@ def learner_role(join: JoinConfig, stop: threading.Event) -> None:
                 break
         reporter.close()
         publisher.publish(learner.updates, layout, learner.vector())
+        directory.close()
 
 
-def _sample(sampler: Sampler) -> Sample | None:
+def _sample(sampler: ShardedSampler) -> Sample | None:
     """The next batch; None where none came in time."""
     try:
         return sampler.sample(_SAMPLE_S)
@@ -324,7 +330,7 @@ def _synced(place: Joined) -> dict[str, int]:
     if not place.run.config.replay.durable:
         return {}
     try:
-        stats = sync_replay(place.session, place.keys, timeout=10.0)
+        stats = total(sync_all(place.session, place.keys, timeout=10.0))
     except ReplayTimeout:
         return {}
     return {name: int(stats[name]) for name in ("inserts", "samples", "deletes")}
@@ -333,7 +339,7 @@ def _synced(place: Joined) -> dict[str, int]:
 def _replay_rates(place: Joined) -> dict[str, float]:
     """The service's counters for the curves; none while it does not answer."""
     try:
-        stats = fetch_stats(place.session, place.keys, timeout=0.2)
+        stats = total(fetch_all_stats(place.session, place.keys, timeout=0.2))
     except ReplayTimeout:
         return {}
     return {name: float(stats[name]) for name in ("inserts", "samples_per_insert")}

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import tyro
 
-from launch.join import JoinConfig
+from launch.join import JoinConfig, ShardConfig
 from launch.signals import Asked
 from launch.viewing import PageConfig, viewer_config
 
@@ -28,12 +28,12 @@ class ActorRoleConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayRoleConfig:
-    """The replay service of a run."""
+    """A shard of a run's replay."""
 
     join: tyro.conf.OmitArgPrefixes[JoinConfig]
     """Which run."""
-    durable: bool = False
-    """Keeps the rows in the run's folder, whatever its configuration says."""
+    part: tyro.conf.OmitArgPrefixes[ShardConfig]
+    """Which shard, and how."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +65,9 @@ def run_role(name: str, parse: Parse) -> int:
 
 def _replay(parse: Parse) -> Act:
     options = parse(ReplayRoleConfig)
-    from launch.roles import replay_role
+    from launch.replay_role import replay_role
 
-    return lambda stop: replay_role(options.join, stop, durable=options.durable)
+    return lambda stop: replay_role(options.join, options.part, stop)
 
 
 def _actor(parse: Parse) -> Act:

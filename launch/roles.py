@@ -1,10 +1,11 @@
-"""Roles of a run, a process each: replay, actor, viewer (`launch.learning`: learner).
+"""Roles of a run, a process each: actor, viewer.
+
+The others: `launch.replay_role`, `launch.learning`, `launch.evaluator`.
 
 A role ends when its process is asked to or when the run is called off, and says how
 it fares about once a second.
 """
 
-import dataclasses
 import threading
 import time
 from collections import deque
@@ -19,28 +20,12 @@ from actors.acting import ActingConfig, choice_of
 from actors.actor import Tick, exploration, run_actor
 from actors.frames import FrameBatch, encode_frames
 from actors.network import layout_hash, parameter_layout
-from launch.config import (
-    CONFIG,
-    ExperimentConfig,
-    batches_of,
-    read_run,
-    row_spec_of,
-    rows_of_run,
-)
+from launch.config import ExperimentConfig, rows_of_run
 from launch.errors import LaunchError
-from launch.join import (
-    HELD_OUT,
-    REPLAY,
-    SCENES,
-    TRAIN,
-    JoinConfig,
-    Joined,
-    joined,
-    train_bank,
-)
+from launch.join import JoinConfig, Joined, joined, train_bank
 from launch.status import STATUS_S
 from replay.channels import FramePublisher, StatusPublisher
-from replay.client import Writer
+from replay.shards_writer import ShardedWriter
 from replay.weights import WeightsSubscriber
 from replay.wire import Weights
 from sim.observation import observation_sizes
@@ -51,52 +36,6 @@ if TYPE_CHECKING:
 EPISODES: Final = 200  # that the reported rates are over
 _WAIT_S: Final = 0.5  # between two looks at the reasons to stop
 _FLUSH_S: Final = 0.5  # for the last rows, when the run may be gone already
-
-
-def replay_role(
-    join: JoinConfig, stop: threading.Event, *, durable: bool = False
-) -> None:
-    """Serves the replay, and the run's files to those who have none of it.
-
-    `durable`: even if the run's configuration does not say so.
-    """
-    if not join.listen:
-        raise LaunchError("the replay service needs --listen tcp/HOST:PORT")
-    if join.run is None:
-        raise LaunchError("the replay service serves a run's folder: name it by --run")
-    from launch.join import follow
-    from replay.channels import ControlSubscriber
-    from replay.files import FileServer
-    from replay.keys import RunKeys
-    from replay.session import check_endpoints, open_session
-
-    check_endpoints((*join.listen, *join.connect), join.insecure)
-    run = read_run(join.run)
-    replay = run.config.replay
-    if durable:
-        replay = dataclasses.replace(replay, durable=True)
-    keys = RunKeys(join.run_id)
-    # The port answers before torch is loaded: the other roles start meanwhile.
-    with open_session(connect=join.connect, listen=join.listen, router=True) as session:
-        control = ControlSubscriber(session, keys)
-        follow(control, stop)
-        scenes = join.run / SCENES
-        files = {name: scenes / name for name in (TRAIN, HELD_OUT)}
-        files[CONFIG] = join.run / CONFIG
-        offered = FileServer(session=session, keys=keys, files=files)
-        from replay.server import ReplayServer
-
-        ReplayServer(
-            session=session,
-            keys=keys,
-            spec=row_spec_of(run),
-            config=replay,
-            seed=run.config.seed,
-            folder=join.run / REPLAY / str(keys.shard),
-            largest=batches_of(run),
-        ).run(stop)
-        offered.close()
-        control.close()
 
 
 @dataclass(frozen=True)
@@ -178,12 +117,14 @@ def _act(place: Joined, actor: int, stop: threading.Event) -> None:
     first = _first_weights(subscriber, policy_layout_hash(config), stop)
     if first is None:
         return
-    writer = Writer(
-        session=place.session,
-        keys=place.keys,
+    directory = place.directory(spec, wanted=())
+    writer = ShardedWriter(
+        directory=directory,
         spec=spec,
         writer=actor,
         epoch=epoch,
+        shards=config.shards,
+        durable=config.replay.durable,
         window=config.actor.window,
         batch_rows=config.actor.environments * config.actor.scan_steps,
     )
@@ -212,6 +153,7 @@ def _act(place: Joined, actor: int, stop: threading.Event) -> None:
     )
     _report_actor(ticks, status, writer, stop)
     writer.close(_FLUSH_S)
+    directory.close()
 
 
 def _first_weights(
@@ -234,7 +176,7 @@ def _first_weights(
 def _report_actor(
     ticks: Iterator[Tick],
     status: StatusPublisher,
-    writer: Writer,
+    writer: ShardedWriter,
     stop: threading.Event,
 ) -> None:
     """Drives the loop and publishes its counters."""

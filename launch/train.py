@@ -6,16 +6,15 @@
         evaluation.csv       how checkpoints drove           best/  of them
         evaluation.json .md .png .rrd   scores and a recording    status.json
 
-One replay service (critical unless it is durable), a learner that ends the run and is
-started again from its newest checkpoint, and actors that are started again are
-processes of their own, connected over Zenoh on loopback. With `serial` they take turns
-in this process.
+One replay service (critical unless it is durable) or several shards, a learner that
+ends the run and is started again from its newest checkpoint, and actors that are
+started again are processes of their own, connected over Zenoh on loopback. With
+`serial` they take turns in this process.
 """
 
 import asyncio
 import contextlib
 import dataclasses
-import socket
 import sys
 import time
 import uuid
@@ -40,7 +39,7 @@ from launch.config import (
 )
 from launch.converting import say
 from launch.errors import INTERRUPTED, LaunchError
-from launch.join import HELD_OUT, SCENES, TRAIN, check_bank
+from launch.join import HELD_OUT, SCENES, TRAIN, check_bank, free_port
 from launch.scenes import PROCEDURAL, prepare_banks
 from launch.supervisor import Outcome, Result, Role, Supervisor
 from sim.bank import open_bank
@@ -159,16 +158,16 @@ def _taken_up(folder: Path, options: TrainConfig, algorithm: Algorithm) -> RunFi
     config = resolved(options)
     if run.config.replay.durable:  # its rows are there to go on with
         config = with_durable_replay(config)
+        if config.shards not in (1, run.config.shards):
+            raise LaunchError(
+                f"{folder}: its rows lie in {run.config.shards} shards and cannot be "
+                f"dealt out to {config.shards}; resume with --shards "
+                f"{run.config.shards}"
+            )
+        config = dataclasses.replace(config, shards=run.config.shards)
     run = dataclasses.replace(run, config=config)
     run.write(folder)
     return run
-
-
-def free_port() -> int:
-    """A port of loopback that nothing listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,6 +214,15 @@ def joining_lines(run: RunFile, placement: Placement) -> list[str]:
     ]
 
 
+def beside(listen: tuple[str, ...], shard: int) -> tuple[str, ...]:
+    """Endpoints for a shard where the hub has these: ports counted on from there."""
+    found = []
+    for endpoint in listen:
+        address, _, port = endpoint.rpartition(":")
+        found.append(f"{address}:{int(port) + shard}")
+    return tuple(found)
+
+
 def roles_of(folder: Path, run: RunFile, port: int, placement: Placement) -> list[Role]:
     """The processes of a run that are started here."""
     endpoint = f"tcp/127.0.0.1:{port}"
@@ -229,10 +237,25 @@ def roles_of(folder: Path, run: RunFile, port: int, placement: Placement) -> lis
                 *placement.listen,
                 *(("--insecure",) if placement.insecure else ()),
             ),
-            # A durable one goes on where it was killed, and an expert's is filled
-            # again; another has lost its rows.
-            critical=not run.config.replay.durable and run.algorithm == "dqn",
+            # A durable one goes on where it was killed, an expert's is filled again,
+            # and where there are others the run can do without its rows.
+            critical=not run.config.replay.durable
+            and run.algorithm == "dqn"
+            and run.config.shards == 1,
             port=port,
+        ),
+        *(
+            Role(
+                name=f"replay-{shard}",
+                command=(
+                    *(*command, "replay", *client),
+                    *("--listen", f"tcp/127.0.0.1:{free_port()}"),
+                    *beside(placement.listen, shard),
+                    *(("--insecure",) if placement.insecure else ()),
+                    *("--shard", str(shard)),
+                ),
+            )
+            for shard in range(1, run.config.shards)
         ),
         Role(
             name="learner",
@@ -335,6 +358,8 @@ async def supervise(
 def train_command(options: TrainConfig) -> int:
     """`slipstream train dqn`; the exit code."""
     placement = placement_of(options, resolved(options).actors)
+    if options.serial and resolved(options).shards > 1:
+        raise LaunchError("--serial runs one table in this process: leave out --shards")
     folder, run = prepare(options)
     say(f"run: {folder}  ({', '.join(run.scenes)}, preset {options.preset})")
     if options.serial:

@@ -11,18 +11,20 @@ is P(i) = p_i / (sum of p): one big table's, and so are the draws. That is the s
 taken while every shard gives rows as fast as they are used.
 
 It cannot be kept where a shard's rate limiter admits less than its share, for instance
-because its writers stand still: then the shard's share is what it was seen to give, an
-average over some 32 batches, and the others take the rest in proportion to their
-masses. Equal shares were rejected: rows of a shard of small priorities would be drawn
+because its writers stand still. A shard that has not given its share within 20 ms is
+late until it has as many rows at hand as are asked for at once: it is not waited for,
+its share is what it was seen to give, an average over some 32 batches, and the others
+take the rest in proportion to their masses.
+
+Equal shares were rejected: rows of a shard of small priorities would be drawn
 more often than in one table, and be weighted down, at the price of variance. Whole
 batches from one shard at a time were, too: the largest weight of a batch, by which a
 learner divides, would then be a shard's and not the run's.
 
 n_s is rounded by one random offset for all (systematic sampling): never further than 1
 from B share_s, and equal to it on average. The rows of a reply are dealt out in random
-order, as they come sorted by where they lie in the table. A shard that gives nothing
-for `_PATIENCE_S` is waited for no longer until it gives again. What a shard that left
-has given and was not used yet is dropped with it.
+order, as they come sorted by where they lie in the table.
+What a shard that left has given and was not used yet is dropped with it.
 """
 
 import threading
@@ -115,8 +117,9 @@ def shares_of(
     free = np.ones(len(masses), bool)
     while (left := 1.0 - shares.sum()) > 1e-12 and free.any():
         weights = np.where(free, masses, 0.0)
-        if weights.sum() <= 0.0:
-            weights = free.astype(float)
+        # Divided by the largest first: the smallest floats do not survive a product.
+        largest = weights.max()
+        weights = weights / largest if largest > 0.0 else free.astype(float)
         wanted = shares + left * weights / weights.sum()
         over = free & (wanted >= limits)
         if not over.any():
@@ -257,10 +260,7 @@ class ShardedSampler:
 
     def _limits(self, supplies: Sequence[Supply]) -> Float[np.ndarray, " shards"]:
         """The largest shares that the shards can keep up."""
-        full = self._batch_size * self._batches
-        given = [
-            1.0 if s.rows >= full else s.given / self._batch_size for s in supplies
-        ]
+        given = [s.given / self._batch_size if s.late else 1.0 for s in supplies]
         return np.minimum(1.0, np.array(given))
 
     def _next(self, waited: float) -> Sample | None:
@@ -279,13 +279,16 @@ class ShardedSampler:
         size = self._batch_size
         if sum(supply.rows for supply in supplies) < size:
             return False
+        for supply in supplies:
+            supply.late &= supply.rows < size * self._batches
         masses = np.array([supply.mass for supply in supplies])
-        wanted = np.ceil(size * shares_of(masses, self._limits(supplies)))
+        limits = self._limits(supplies)
+        if limits.sum() < 1.0:  # all are late
+            return True
+        wanted = np.ceil(size * shares_of(masses, limits))
         missing = False
         for supply, rows in zip(supplies, wanted, strict=True):
-            if supply.rows >= size * self._batches:
-                supply.late = False
-            elif supply.rows < rows:
+            if supply.rows < rows:
                 supply.late |= waited >= _PATIENCE_S
                 missing |= not supply.late
         return not missing
