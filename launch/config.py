@@ -155,7 +155,7 @@ class ExperimentConfig:
                 f"shards={self.shards} must be 1 to {min(256, self.replay.min_size)}"
             )
         insert_rows, sample_rows = largest_batches(self)
-        shard_replay(self).limiter().check_batches(
+        self.replay.part_of(self.shards).limiter().check_batches(
             insert_rows=insert_rows, sample_rows=sample_rows
         )
 
@@ -383,22 +383,6 @@ def batches_of(run: RunFile) -> tuple[int, int]:
         reply = run.config.learner.batches_per_reply
         return FILL_ROWS, run.config.cloning.batch_size * reply
     return largest_batches(run.config)
-
-
-def shard_replay(config: ExperimentConfig) -> ReplayConfig:
-    """The settings of one of the run's shards.
-
-    Capacity and minimum are shared out. The limiter's tolerance, in samples, is not:
-    each shard has to let the same batches pass as one table would.
-    """
-    replay, shards = config.replay, config.shards
-    min_size = max(1, replay.min_size // shards)
-    return dataclasses.replace(
-        replay,
-        capacity=-(-replay.capacity // shards),
-        min_size=min_size,
-        tolerance=replay.tolerance * replay.min_size / min_size,
-    )
 
 
 def largest_batches(config: ExperimentConfig) -> tuple[int, int]:

@@ -51,7 +51,8 @@ from launch.join import JoinConfig, Joined, joined, train_bank
 from launch.replay_stats import place_of
 from replay.client import fetch_rows
 from replay.keys import RunKeys
-from replay.shards import global_ids, live_shards
+from replay.shards import global_ids
+from replay.shards_tools import shards_to_ask
 from replay.spec import RowSpec, Sample
 from sim.bank import Bank
 from sim.observation import Observation, ObservationConfig
@@ -170,7 +171,7 @@ def write(file: Any, pages: Iterator[Sample], place: Joined, observe: bool) -> i
 
 def all_pages(place: Joined, spec: RowSpec) -> Iterator[Sample]:
     """Every row of every shard that is up, under its id in the run."""
-    for shard in live_shards(place.session, place.keys):
+    for shard in shards_to_ask(place.session, place.keys):
         for page in fetch_rows(
             session=place.session,
             keys=RunKeys(place.keys.run_id, shard),

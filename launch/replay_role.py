@@ -18,7 +18,6 @@ from launch.config import (
     batches_of,
     read_run,
     row_spec_of,
-    shard_replay,
 )
 from launch.errors import LaunchError
 from launch.join import (
@@ -132,7 +131,7 @@ def _serve_shard(join: JoinConfig, options: ShardConfig, stop: threading.Event) 
 
 
 def _settings(config: ExperimentConfig, options: ShardConfig) -> ReplayConfig:
-    replay = shard_replay(config)
+    replay = config.replay.part_of(config.shards)
     return dataclasses.replace(replay, durable=True) if options.durable else replay
 
 

@@ -45,8 +45,9 @@ from launch.evaluator import CheckpointJudge
 from launch.evaluator_best import Judgement
 from launch.join import SCENES, TRAIN
 from launch.learning import spent
+from launch.placement import Placement
 from launch.scenes import PROCEDURAL
-from launch.train import Placement, TrainConfig, finish, prepare, supervised
+from launch.train import TrainConfig, finish, prepare, supervised
 from learner.cloning import clone
 from sim.bank import open_bank
 

@@ -4,7 +4,7 @@ The service owns one of these; serial mode uses it directly, so that a run in on
 process has the same semantics and, under a seed, the same draws every time.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
@@ -71,6 +71,20 @@ class ReplayConfig:
             min_size=self.min_size,
             tolerance=self.tolerance * self.samples_per_insert * self.min_size,
             max_times_sampled=self.max_times_sampled,
+        )
+
+    def part_of(self, shards: int) -> "ReplayConfig":
+        """The settings of one of so many shards.
+
+        Capacity and minimum are shared out. The limiter's tolerance, in samples, is
+        not: each shard has to let the same batches pass as one table would.
+        """
+        min_size = max(1, self.min_size // shards)
+        return replace(
+            self,
+            capacity=-(-self.capacity // shards),
+            min_size=min_size,
+            tolerance=self.tolerance * self.min_size / min_size,
         )
 
 

@@ -19,7 +19,7 @@ import pytest
 
 from actors.rows import row_spec
 from launch.config import BudgetConfig, quick, read_run
-from launch.train import free_port
+from launch.join import free_port
 from replay.client import fetch_rows, fetch_stats
 from replay.keys import RunKeys
 from replay.session import open_session

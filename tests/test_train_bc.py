@@ -33,7 +33,8 @@ from launch.config import (
 )
 from launch.errors import LaunchError
 from launch.main import main
-from launch.train import Placement, TrainConfig, prepare, roles_of
+from launch.placement import Placement, roles_of
+from launch.train import TrainConfig, prepare
 from launch.train_bc import TrainBcConfig, clone_serially, prepare_cloning
 from learner.curves import read_curves
 from replay.local import LocalReplay
