@@ -22,6 +22,7 @@ from typing import Any, Final, Literal
 
 import msgspec
 
+from actors.acting import Objects
 from actors.actor import ActorConfig
 from actors.mixture import action_limits
 from actors.network import (
@@ -330,6 +331,12 @@ def with_environments(config: ExperimentConfig, count: int) -> ExperimentConfig:
     """The same run with another number of environments per actor."""
     watched = min(config.actor.watched, count)
     actor = dataclasses.replace(config.actor, environments=count, watched=watched)
+    return dataclasses.replace(config, actor=actor)
+
+
+def with_objects(config: ExperimentConfig, objects: Objects) -> ExperimentConfig:
+    """The same run with other objects of each scene controlled."""
+    actor = dataclasses.replace(config.actor, objects=objects)
     return dataclasses.replace(config, actor=actor)
 
 

@@ -25,6 +25,7 @@ from typing import Annotated, Any, Final, Literal
 import tyro
 from rich.console import Console
 
+from actors.acting import Objects
 from launch.config import (
     CONFIG,
     Algorithm,
@@ -35,6 +36,7 @@ from launch.config import (
     read_run,
     with_durable_replay,
     with_environments,
+    with_objects,
 )
 from launch.converting import say
 from launch.errors import INTERRUPTED, LaunchError
@@ -61,6 +63,9 @@ class TrainConfig:
     """Goes on with an existing run, from its newest checkpoint."""
     envs: int | None = None
     """Environments per actor; the same as --actor.environments."""
+    objects: Objects | None = None
+    """Whom an environment controls and the policy learns from; the same as
+    --actor.objects."""
     serial: bool = False
     """Runs all roles in this process, in a fixed order: same seed, same losses."""
     durable: bool = False
@@ -93,6 +98,8 @@ def resolved(options: TrainConfig) -> ExperimentConfig:
     config = options.config
     if options.durable:
         config = with_durable_replay(config)
+    if options.objects is not None:
+        config = with_objects(config, options.objects)
     if options.envs is None:
         return config
     return with_environments(config, options.envs)
