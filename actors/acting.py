@@ -124,11 +124,13 @@ def own_first(slots: int) -> Int[np.ndarray, "slots slots"]:
     )
 
 
-def start(
-    key: PRNGKeyArray, bank: Bank, environments: int, config: ActingConfig
-) -> Running:
-    """M random scenes from their starts."""
-    begin = starts(bank, config.choose, config.environment)
+def begin_of(bank: Bank, config: ActingConfig) -> State:
+    """Every scene at its start, with what an environment controls there."""
+    return starts(bank, config.choose, config.environment)
+
+
+def start(key: PRNGKeyArray, begin: State, environments: int) -> Running:
+    """M random scenes from their starts; `begin` is `begin_of`."""
     state = draw(key, begin, environments)
     return Running(
         state=state,
@@ -141,14 +143,17 @@ def start(
 def act(
     key: PRNGKeyArray,
     bank: Bank,
+    begin: State,
     vector: Float[Array, " parameters"],
     running: Running,
     epsilon: Float[Array, " environments"],
     config: ActingConfig,
 ) -> tuple[Running, Transitions]:
-    """K steps of all environments. Compile with `config` static."""
+    """K steps of all environments. Compile with `config` static.
 
-    begin = starts(bank, config.choose, config.environment)
+    `begin` is made once (`begin_of`): it takes 0.35 ms for 64 scenes and grows with
+    their number, where a scan of 8 steps of 16 environments takes 5.
+    """
 
     def one(carry: Running, step_key: PRNGKeyArray) -> tuple[Running, Transitions]:
         return _step(step_key, bank, begin, vector, carry, epsilon, config)

@@ -128,9 +128,8 @@ def run_actor(
     """
     start_key, key = jax.random.split(key)
     act = jax.jit(functools.partial(acting.act, config=config))
-    running = jax.jit(acting.start, static_argnums=(2, 3))(
-        start_key, bank, len(epsilon), config
-    )
+    begin = acting.begin_of(bank, config)
+    running = jax.jit(acting.start, static_argnums=2)(start_key, begin, len(epsilon))
     windows = Windows(n_step=config.n_step, discount=config.discount, actor=actor)
     batch_rows = len(epsilon) * config.scan_steps
     version, vector = -1, jnp.zeros(0)
@@ -141,7 +140,9 @@ def run_actor(
             version, vector = weights.version, _on_device(weights.vector)
         began = time.perf_counter()
         key, scan_key = jax.random.split(key)
-        running, batch = act(scan_key, bank, vector, running, jnp.asarray(epsilon))
+        running, batch = act(
+            scan_key, bank, begin, vector, running, jnp.asarray(epsilon)
+        )
         transitions: Transitions = jax.device_get(batch)
         acted = time.perf_counter()
         steps += int(transitions.present.sum())

