@@ -12,10 +12,10 @@ from rich.table import Table
 
 from launch.config import write_atomically
 from launch.errors import LaunchError
-from replay.client import fetch_stats
 from replay.control import PERCENTILES
 from replay.keys import RunKeys
 from replay.session import check_endpoints, open_session
+from replay.shards_tools import fetch_all_stats, total
 
 ENDPOINT: Final = "endpoint.json"  # of a run in progress, see `launch.view`
 _WATCH_S: Final = 1.0
@@ -118,12 +118,30 @@ def _spread(percentiles: Mapping[str, float]) -> str:
     return "  ".join(f"{name} {value:.4g}" for name, value in percentiles.items())
 
 
+def _table_of(shards: Mapping[str, Mapping[str, Any]]) -> Table:
+    """A line for each shard."""
+    table = Table("shard", "rows", "inserts", "samples", "ratio", "debt", "age, median")
+    for number, told in shards.items():
+        table.add_row(
+            number,
+            f"{told['size']:,}",
+            f"{told['inserts']:,}, {told['insert_rate']:.0f}/s",
+            f"{told['samples']:,}, {told['sample_rate']:.0f}/s",
+            f"{told['samples_per_insert']:.3f}",
+            f"{told['debt']:.0f}",
+            f"{told['ages'].get('p50', 0):.0f}",
+        )
+    return table
+
+
 def show(figures: Mapping[str, Any], console: Console) -> None:
     """Two tables: the replay, and its writers."""
     table = Table(show_header=False)
     for row in _rows(figures):
         table.add_row(*row)
     console.print(table)
+    if figures["shards"] > 1:
+        console.print(_table_of(figures["each"]))
     writers = Table("writer", "rows", "next batch", "waiting", "last stored [s ago]")
     for told in figures["writers"]:
         writers.add_row(
@@ -143,7 +161,9 @@ def stats_command(options: StatsConfig) -> int:
     keys, console, never = RunKeys(run_id), Console(), threading.Event()
     with open_session(connect=connect) as session:
         while True:
-            figures = derived(fetch_stats(session, keys))
+            shards = fetch_all_stats(session, keys)
+            figures = derived(total(shards))
+            figures["each"] = {str(n): derived(told) for n, told in shards.items()}
             if options.json == "-":
                 print(json.dumps(figures), flush=True)
             else:

@@ -65,6 +65,8 @@ def total(stats: Mapping[int, Stats]) -> Stats:
         whole[name] = sum(shard[name] for shard in shards)
     whole["samples_per_insert"] = whole["samples"] / max(1, whole["inserts"])
     whole["fault"] = next((shard["fault"] for shard in shards if shard["fault"]), "")
+    if len(shards) > 1:  # the percentiles of all do not follow from each one's
+        whole["ages"], whole["priorities"] = [], []
     whole["writers"] = [told for shard in shards for told in shard["writers"]]
     whole["shards"] = len(shards)
     return whole

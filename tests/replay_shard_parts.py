@@ -36,7 +36,7 @@ class Shard:
         number: int,
         config: ReplayConfig,
         *,
-        hub: "Shard | None" = None,
+        hub: "Shard | str | None" = None,
         endpoint: str = "",
         folder: Path | None = None,
         spec: RowSpec = SPEC,
@@ -45,7 +45,8 @@ class Shard:
         self.endpoint = endpoint or free_endpoint()
         self.keys = RunKeys(KEYS.run_id, number)
         self.router = open_session(listen=[self.endpoint], router=True)
-        self.hub = open_session(connect=[hub.endpoint]) if hub else self.router
+        reached = hub.endpoint if isinstance(hub, Shard) else hub
+        self.hub = open_session(connect=[reached]) if reached else self.router
         self.claim = ShardClaim(self.hub, self.keys)
         self.server = ReplayServer(
             session=self.router,
