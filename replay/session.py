@@ -10,6 +10,9 @@ Settings that were measured to matter:
 - `connect/retry` from 50 ms: sessions are back 0.3 s after a service's restart
   instead of 1.5 s;
 - shared memory on both sides of a machine: 6.5 GB/s instead of 1.3 to 2.0;
+- room for 16 batches of 64 KB to be sent per link instead of 2: whoever answers with
+  512 KB does not wait for the socket seven times. A draw of 64 rows of 8 KB by TCP
+  takes a quarter less CPU time;
 - `wait_before_close` and the lease at 60 s: a peer that stalls for seconds (a
   compilation, a debugger) otherwise loses its link and all that was queued on it.
 """
@@ -93,6 +96,7 @@ def _config(
         "transport/shared_memory/transport_optimization/enabled": (
             shared_memory and local
         ),
+        f"{link}/queue/size/data": 16,
         f"{link}/lease": int(STALL_S * 1e3),
         f"{link}/queue/congestion_control/block/wait_before_close": int(STALL_S * 1e6),
     }
