@@ -151,8 +151,8 @@ def act(
 ) -> tuple[Running, Transitions]:
     """K steps of all environments. Compile with `config` static.
 
-    `begin` is made once (`begin_of`): it takes 0.35 ms for 64 scenes and grows with
-    their number, where a scan of 8 steps of 16 environments takes 5.
+    `begin` is made once (`begin_of`): it takes 0.35 ms for 64 scenes and 4.5 for 2,000,
+    where a scan of 8 steps of 16 environments takes 5.
     """
 
     def one(carry: Running, step_key: PRNGKeyArray) -> tuple[Running, Transitions]:
