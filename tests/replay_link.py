@@ -131,6 +131,8 @@ def run(a: int, b: int) -> None:
 
 
 if __name__ == "__main__":
-    devices = [open_device(*pair) for pair in zip(sys.argv[1:3], ADDRESSES, strict=True)]
+    devices = [
+        open_device(*pair) for pair in zip(sys.argv[1:3], ADDRESSES, strict=True)
+    ]
     print("ready", flush=True)
     run(*devices)
