@@ -168,6 +168,7 @@ def test_draws_from_shards_of_different_sizes_are_one_tables() -> None:
         assert eventually(lambda: sampler.sample(20.0).size == 100)
 
 
+@pytest.mark.slow
 def test_a_shard_whose_writers_stand_still_holds_nobody_up() -> None:
     """Shard 1 gives 800 rows and then none until 50 more are written to it."""
     limited = ReplayConfig(
@@ -214,6 +215,7 @@ def test_a_shard_whose_writers_stand_still_holds_nobody_up() -> None:
         assert eventually(lambda: (shard_of(sampler.sample(20.0).ids) == 1).any())
 
 
+@pytest.mark.slow
 def test_writers_move_from_a_shard_that_left_and_back() -> None:
     with (
         shards_of(INSERTS, 3) as shards,
