@@ -128,6 +128,12 @@ def _sim(words: list[str], prog: str) -> int:
     return sim_command(_parse(SimConfig, words, prog))
 
 
+def _bench_learner(words: list[str], prog: str) -> int:
+    from launch.bench_learner import BenchLearnerConfig, bench_learner_command
+
+    return bench_learner_command(_parse(BenchLearnerConfig, words, prog))
+
+
 def _doctor(words: list[str], prog: str) -> int:
     from launch.doctor import DoctorConfig, doctor_command
 
@@ -177,6 +183,7 @@ COMMANDS: Final = {
     "scenes procedural": Command("generates scenes into a bank", _procedural),
     "view": Command("shows a run in progress or a recording", _view),
     "bench sim": Command("measures the simulator", _sim),
+    "bench learner": Command("measures the learner's updates", _bench_learner),
     "bench pipeline": Command("measures a run of the quick preset", _pipeline),
     "sweep bc": Command("clones at each point of the paper's grid", _sweep),
     "sweep dqn": Command("trains double DQN at each point of the grid", _sweep),

@@ -18,13 +18,21 @@ from typing import NamedTuple, final
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from actors.mixture import FIRST_SCALE, action_limits, policy_outputs
 from actors.network import Layout, NetworkConfig, parameter_layout
 from learner.config import CloningConfig
 from learner.mixture import mixture_log_prob, softmax_log_prob, split_mixture
 from learner.network import QNetwork, follow_average, to_torch, to_vector
+from learner.training import (
+    compute_device,
+    in_precision,
+    make_adam,
+    restore_training,
+    step_down,
+    training_state,
+)
 from sim.dynamics import ActionConfig
 from sim.observation import Observation, ObservationSizes
 
@@ -65,7 +73,7 @@ class CloningLearner:
         self.sizes = sizes
         self.actions = policy_outputs(action, config.mixture)
         self.updates = 0
-        self._device = torch.device(config.device)
+        self._device = compute_device(config.device)
         self._limits = torch.from_numpy(action_limits(action)).to(self._device)
         generator = torch.Generator().manual_seed(config.seed)
         build = functools.partial(
@@ -81,11 +89,10 @@ class CloningLearner:
         self.network.to(self._device)
         self.average = build().to(self._device).requires_grad_(False)
         self.average.load_state_dict(self.network.state_dict())
-        self.optimiser = torch.optim.Adam(
-            self.network.parameters(),
-            lr=config.learning_rate,
-            eps=config.adam_epsilon,
-            fused=True,
+        self.optimiser = make_adam(
+            self.network,
+            learning_rate=config.learning_rate,
+            epsilon=config.adam_epsilon,
         )
 
     @property
@@ -109,15 +116,12 @@ class CloningLearner:
     def update(self, batch: CloningBatch) -> CloningResult:
         """One step of Adam on the batch."""
         loss = -self._log_prob(self.network, batch).mean()
-        self.optimiser.zero_grad(set_to_none=True)
-        torch.autograd.backward(loss)
-        gradient_norm = float("nan")
-        if self.config.max_gradient_norm:
-            norm = torch.nn.utils.clip_grad_norm_(
-                self.network.parameters(), self.config.max_gradient_norm, foreach=True
-            )
-            gradient_norm = float(norm)
-        self.optimiser.step()
+        gradient_norm = step_down(
+            loss,
+            network=self.network,
+            optimiser=self.optimiser,
+            limit=self.config.max_gradient_norm,
+        )
         self.updates += 1
         follow_average(
             self.average,
@@ -135,31 +139,17 @@ class CloningLearner:
 
     def state(self) -> dict[str, object]:
         """The whole state, of types that `torch.load(weights_only=True)` reads."""
-        return {
-            "network": self.network.state_dict(),
-            "average": self.average.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "updates": self.updates,
-        }
+        return training_state(self._modules(), self.optimiser, self.updates)
 
     def restore(self, state: Mapping[str, object]) -> None:
         """Goes on from where `state` was taken; the layout has to be the same.
 
         Hyperparameters stay this learner's, so that a resumed run may change them.
         """
-        updates, optimiser = state["updates"], state["optimiser"]
-        networks = (state["network"], state["average"])
-        if not isinstance(updates, int) or not isinstance(optimiser, dict):
-            raise ValueError("not the state of a learner")
-        for module, values in zip((self.network, self.average), networks, strict=True):
-            if not isinstance(values, dict):
-                raise ValueError("not the state of a learner")
-            module.load_state_dict(values)
-        groups = self.optimiser.state_dict()["param_groups"]
-        self.optimiser.load_state_dict(
-            {"state": optimiser["state"], "param_groups": groups}
-        )
-        self.updates = updates
+        self.updates = restore_training(state, self._modules(), self.optimiser)
+
+    def _modules(self) -> dict[str, nn.Module]:
+        return {"network": self.network, "average": self.average}
 
     def _policy(self) -> QNetwork:
         return self.average if self.config.average_updates else self.network
@@ -167,7 +157,8 @@ class CloningLearner:
     def _log_prob(
         self, network: QNetwork, batch: CloningBatch
     ) -> Float[Tensor, " batch"]:
-        outputs = network(*to_torch(batch.observation_tm1, self._device))
+        with in_precision(self.config.precision, self._device):
+            outputs = network(*to_torch(batch.observation_tm1, self._device)).float()
         if not self.config.mixture:
             index = torch.from_numpy(np.ascontiguousarray(batch.a_tm1))
             return softmax_log_prob(outputs, index.to(self._device).long())

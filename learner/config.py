@@ -62,8 +62,11 @@ class LearnerConfig:
     torch_threads: int = 1
     """Threads of torch in the learner's process."""
 
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the network's matrix products; weights and losses are float32 either way."""
+
     device: str = "cpu"
-    """Where torch computes: cpu, cuda, cuda:1, ..."""
+    """Where torch computes: cpu, cuda, cuda:1, ..., or auto: CUDA where there is."""
 
     seed: int = 0
     """Seed of the network's first weights."""
@@ -124,8 +127,11 @@ class CloningConfig:
     torch_threads: int = 1
     """Threads of torch in the learner's process."""
 
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the network's matrix products; weights and losses are float32 either way."""
+
     device: str = "cpu"
-    """Where torch computes: cpu, cuda, cuda:1, ..."""
+    """Where torch computes: cpu, cuda, cuda:1, ..., or auto: CUDA where there is."""
 
     seed: int = 0
     """Seed of the network's first weights."""

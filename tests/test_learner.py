@@ -5,10 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import torch
 
 from actors.network import NetworkConfig
 from learner.learner import Batch, Learner, LearnerConfig, UpdateResult, learn
 from learner.network import to_vector
+from learner.training import compute_device
 from sim.observation import Observation, ObservationSizes
 
 SIZES = ObservationSizes(
@@ -240,3 +242,21 @@ def test_the_policy_is_the_mean_of_the_weights_where_that_is_asked_for(
         expected = expected + share * (learner.vector() - expected)
     np.testing.assert_allclose(learner.policy_vector(), expected, atol=1e-6)
     assert (learner.policy_vector() != learner.vector()).any() == (average_updates > 0)
+
+
+def test_bfloat16_learns_nearly_the_same_and_keeps_float32_weights():
+    exact, fast = make_learner(), make_learner(precision="bfloat16")
+    ours, theirs = losses_of(exact, 20), losses_of(fast, 20)
+    assert ours != theirs
+    np.testing.assert_allclose(ours, theirs, rtol=0.05)
+    assert {p.dtype for p in fast.network.parameters()} == {torch.float32}
+    assert {m["exp_avg"].dtype for m in fast.optimiser.state.values()} == {
+        torch.float32
+    }
+
+
+def test_auto_is_the_device_at_hand_and_a_missing_one_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert compute_device("auto") == torch.device("cpu")
+    with pytest.raises(ValueError, match="give cpu or auto"):
+        compute_device("cuda")

@@ -299,3 +299,13 @@ def test_a_time_axis_needs_whole_states():
     odd = SIZES._replace(agent=20)
     with pytest.raises(ValueError, match="not those of whole states"):
         parameter_layout(NetworkConfig(time_axis=True), odd, ACTIONS)
+
+
+@pytest.mark.parametrize("name", ["sequential", "late latents"])
+def test_bfloat16_on_the_cpu_attends_alike(name):
+    """Its attention, with and without a mask, is float32's within rounding."""
+    network, observations = make_network(FUSIONS[name]), make_observations(7)
+    exact = run_torch(network, observations)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        fast = run_torch(network, observations)
+    assert 0 < np.abs(fast - exact).max() < 0.05 * np.abs(exact).max()
