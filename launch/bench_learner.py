@@ -22,6 +22,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import torch
 from rich.console import Console
@@ -71,11 +73,11 @@ def random_observation(
 ) -> Observation:
     """Normal features; each mask is True with probability `VALID`."""
 
-    def features(*shape: int) -> np.ndarray:
-        return rng.standard_normal((rows, *shape)).astype(np.float32)
+    def features(*shape: int) -> jax.Array:
+        return jnp.asarray(rng.standard_normal((rows, *shape)), jnp.float32)
 
-    def mask(count: int) -> np.ndarray:
-        return rng.random((rows, count)) < VALID
+    def mask(count: int) -> jax.Array:
+        return jnp.asarray(rng.random((rows, count)) < VALID)
 
     return Observation(
         ego=features(sizes.ego),

@@ -93,7 +93,8 @@ class LatentBlock(nn.Module):
         qkv = self.query_key_value(self.query_norm(latents))
         qkv = qkv.view(batch, count, 3, self.heads, width // self.heads)
         mask = None if valid is None else mask_bias(valid)[:, None]
-        y = _attend(*qkv.permute(2, 0, 3, 1, 4).unbind(0), mask)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)
+        y = _attend(q, k, v, mask)
         told = self.out(y.transpose(1, 2).reshape(batch, count, width))
         if valid is not None:
             told = told * valid.any(-1)[:, None, None]
