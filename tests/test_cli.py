@@ -76,6 +76,9 @@ def test_a_person_without_a_command_gets_the_list(
         (["evaluate", "--agent", "ghost"], "unknown; one of log, expert"),
         (["evaluate"], "--agent"),
         (["evaluate", "--agent", "log", "log"], "each once"),
+        (["evaluate", "--agent", "log", "idm", "--record", "a.rrd"], "one --agent"),
+        (["evaluate", "--agent", "log", "--objects", "all", "--record", "a"], "at sdc"),
+        (["sweep", "ppo"], "expected bc or dqn or all and not ppo"),
         (
             ["evaluate", "--agent", "log", "--objects", "some"],
             "choose sdc, all, tracks",

@@ -14,6 +14,7 @@ SHORT = ("doctor", "scenes", "evaluate")
 WORDS = {
     "scenes": 2,
     "train": 2,
+    "sweep": 2,
     "bench": 2,
     "replay": 2,
 }  # a command's words; 1 otherwise
