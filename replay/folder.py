@@ -3,7 +3,7 @@
     meta.json        format, capacity, row layout; written last, so a folder that has
                      one is complete
     rows.bin         the ring, capacity x row bytes
-    priorities.bin   float64 per slot
+    priorities.bin   float32 per slot
     times.bin        uint32 per slot, where draws are counted
     state.bin        counters and writers, see `replay.mapped`
     sync.bin         two snapshots of that, see `replay.syncing`
@@ -25,7 +25,7 @@ from typing import Any, final
 
 from replay.spec import ReplayError, RowSpec
 
-FORMAT = 1
+FORMAT = 2  # 1 had float64 priorities
 META = "meta.json"
 LOCK = "lock"
 ROWS = "rows.bin"

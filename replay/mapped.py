@@ -24,7 +24,7 @@ the writer's repetition is a duplicate, or absent, and then it is the next. A st
 between 1 and 3 costs the rows that were being pushed out, and no others.
 
 Draws: counts per row, then `samples` (one 8-byte store), then the reply leaves: no row
-that a learner received is uncounted. Priorities are single 8-byte stores.
+that a learner received is uncounted. Priorities are single 4-byte stores.
 
 After a power loss (the machine's boot id is another one and the folder was not closed
 in order) pages are on the disk in any order, and the last snapshot is recovered instead
@@ -110,7 +110,7 @@ class MappedStorage(AbstractStorage):
         self._sync_s = sync_s
         self.rows = np.frombuffer(files[ROWS].map, np.uint8).reshape(-1, row_bytes)
         self.capacity = len(self.rows)
-        self.priorities = np.frombuffer(files[PRIORITIES].map, "<f8")
+        self.priorities = np.frombuffer(files[PRIORITIES].map, "<f4")
         self.times = None
         if TIMES in files:
             self.times = np.frombuffer(files[TIMES].map, "<u4")
@@ -341,7 +341,7 @@ def open_storage(
         made = is_made(folder, meta)
         sizes = {
             ROWS: capacity * spec.row_bytes,
-            PRIORITIES: capacity * 8,
+            PRIORITIES: capacity * 4,
             STATE: ENTRIES + MAX_WRITERS * ENTRY_BYTES,
             SYNC: 2 * (HEAD_BYTES + MAX_WRITERS * ENTRY_BYTES),
         }

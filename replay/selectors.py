@@ -1,18 +1,19 @@
 """Which slots of the ring are drawn: in proportion to priority, or uniformly.
 
-Rows lie in a ring; those in the table are a window of it (`Window`). The tree is
-torchrl's, which checks nothing: a bad index corrupts memory, so whoever calls has
-checked slots and priorities. It is the float64 one: drawing 64 from a million costs
-12 us against 10 in float32, and a float32 target near 10^6 moves in steps of 0.06, so
-that light rows could not be drawn at all.
+Rows lie in a ring; those in the table are a window of it (`Window`). Masses are float32
+and their sums float64 (`replay.sum_tree`), and the probabilities told are those of these
+masses: a float32 target near 10^6 would move in steps of 0.06, so that light rows could
+not be drawn at all, while a rounded mass only is another mass.
 """
 
 import abc
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Literal, final
 
 import numpy as np
 from jaxtyping import Float, Int64
+
+from replay.sum_tree import SumTree, as_float32
 
 SamplerName = Literal["prioritized", "uniform", "fifo"]
 
@@ -117,13 +118,8 @@ class PrioritizedSelector(AbstractSelector):
 
     def __init__(self, *, capacity: int, exponent: float) -> None:
         """Starts with no mass."""
-        # Here and not at the top: it takes seconds and half a gigabyte, and whoever
-        # only samples uniformly or reads the configuration needs none of it.
-        from torchrl._torchrl import SumSegmentTreeFp64
-
         self._exponent = exponent
-        self._capacity = capacity
-        self._tree: Any = SumSegmentTreeFp64(capacity)
+        self._tree = SumTree(capacity)
 
     def set(
         self,
@@ -131,34 +127,18 @@ class PrioritizedSelector(AbstractSelector):
         priorities: Float[np.ndarray, " rows"],
     ) -> None:
         """See the base class."""
-        self._tree.update(slots, np.asarray(priorities**self._exponent, np.float64))
+        wide = np.asarray(priorities, np.float64)
+        self._tree.update(slots, as_float32(wide**self._exponent))
 
     def draw(
         self, positions: Float[np.ndarray, " rows"], window: Window
     ) -> tuple[Int64[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
         """See the base class."""
-        total = self.total(window.size)
+        total = self._tree.total
         if total <= 0.0:
             return UniformSelector().draw(positions, window)
-        slots = self._scan(positions * total)
-        masses = self._tree.at(slots)
-        # A target within rounding of a boundary can land on a row without mass.
-        for share in (0.5, 0.25, 0.75):
-            empty = masses <= 0.0
-            if not empty.any():
-                return slots, masses / total
-            moved = self._scan(positions[empty] * (total * share))
-            slots[empty] = moved
-            masses[empty] = self._tree.at(moved)
-        everything = window.slots()
-        heaviest = everything[int(np.argmax(self.masses(everything)))]
-        slots[masses <= 0.0] = heaviest
+        slots = self._tree.find(positions * total)
         return slots, self._tree.at(slots) / total
-
-    def _scan(self, targets: Float[np.ndarray, " rows"]) -> Int64[np.ndarray, " rows"]:
-        """The first slot at which the running sum reaches the target."""
-        # It returns the tree's size for a target above the sum.
-        return np.minimum(self._tree.scan_lower_bound(targets), self._capacity - 1)
 
     def masses(self, slots: Int64[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
         """See the base class."""
@@ -166,7 +146,7 @@ class PrioritizedSelector(AbstractSelector):
 
     def total(self, live: int) -> float:
         """See the base class."""
-        return float(self._tree.query(0, self._capacity))
+        return self._tree.total
 
     def priorities(
         self, slots: Int64[np.ndarray, " rows"]
@@ -176,14 +156,18 @@ class PrioritizedSelector(AbstractSelector):
 
     @property
     def memory_bytes(self) -> int:
-        """Two float64 per leaf, of which there are a power of two."""
-        return 16 << (self._capacity - 1).bit_length()
+        """4.6 bytes per slot."""
+        return self._tree.memory_bytes
+
+    def check_invariants(self) -> None:
+        """Asserts what must hold after every operation; for tests."""
+        self._tree.check_invariants()
 
 
 def make_selector(
     name: SamplerName, *, capacity: int, exponent: float
 ) -> AbstractSelector:
-    """The selector of these settings; only one with a tree loads torch.
+    """The selector of these settings.
 
     FIFO needs no selector: `Table` draws in the order of the ids.
     """

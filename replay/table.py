@@ -7,7 +7,7 @@ Rows have global ids 0, 1, 2, ... in the order of insertion; row `id` lies in sl
                   al. 2016, eq. 1). New rows have p = 1 (as Acme inserts them); the
                   learner later sets |TD error|. Rows of priority 0 are not drawn; if
                   all are 0, the draw is uniform
-    uniform       every row alike; needs no tree (and no torch), as does alpha = 0
+    uniform       every row alike; needs no tree, as does alpha = 0
     fifo          always the oldest row (Reverb's Fifo selector), until it is removed
 
 A batch of B is drawn stratified: one draw from each of B equal parts of the total mass.
@@ -29,9 +29,10 @@ from jaxtyping import Float, Int64, Integer, UInt8, UInt64
 from replay.selectors import PrioritizedSelector, SamplerName, Window, make_selector
 from replay.spec import ReplayError, RowSpec
 from replay.storage import AbstractStorage, MemoryStorage, WriterMark
+from replay.sum_tree import as_float32
 
 INITIAL_PRIORITY = 1.0
-MAX_PRIORITY = 1e30  # larger ones would overflow the total mass of a full table
+MAX_PRIORITY = np.float32(1e30)  # and so masses, and any sum of them, are finite
 _ROUNDS = 8  # of refused draws before the rows that are left are listed
 
 
@@ -89,7 +90,7 @@ class Table:
         self._removed = int(len(slots) - live.sum())
         if live.any():
             self._cursor = self._oldest + int(np.argmax(live))
-        priorities = np.full(len(slots), INITIAL_PRIORITY)
+        priorities = np.full(len(slots), INITIAL_PRIORITY, np.float32)
         if self._storage.priorities is not None:
             priorities = self._storage.priorities[slots]
         # What a power loss left half written must not reach the tree.
@@ -286,7 +287,7 @@ class Table:
         wanted = ids.astype(np.uint64)
         there = (wanted >= np.uint64(self._oldest)) & (wanted < np.uint64(self.inserts))
         slots = (wanted[there] % np.uint64(self.capacity)).astype(np.int64)
-        new = priorities[there].astype(np.float64)
+        new = as_float32(priorities[there])
         live = self._live(slots)
         slots, new = slots[live], new[live]
         if len(slots):
@@ -354,6 +355,7 @@ class Table:
         if isinstance(self._selector, PrioritizedSelector):
             whole = self._selector.masses(np.arange(self.capacity))
             assert np.isclose(whole.sum(), masses[live].sum(), rtol=1e-9)
+            self._selector.check_invariants()
             assert np.isclose(self._selector.total(self.size), whole.sum(), rtol=1e-9)
 
 

@@ -263,7 +263,7 @@ def test_one_service_per_folder(tmp_path: Path) -> None:
     ("change", "why"),
     [
         ({"capacity": 99}, "holds a replay of capacity 100, this run has 99"),
-        ({"format": 2}, "replay format 2, this version reads 1"),
+        ({"format": 1}, "replay format 1, this version reads 2"),
         ({"schema_hash": "00"}, "holds a replay of schema_hash 00"),
     ],
 )

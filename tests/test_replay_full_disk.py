@@ -55,7 +55,7 @@ def fill(path: Path) -> None:
 def test_what_does_not_fit_is_refused_at_the_start(tmp_path: Path) -> None:
     with small_disk(tmp_path / "disk", 8) as disk:
         whole = ReplayConfig(capacity=1 << 16, durable=True)
-        with pytest.raises(ReplayError, match=r"needs 12\.\d MB on the disk.*capacity"):
+        with pytest.raises(ReplayError, match=r"needs 11\.\d MB on the disk.*capacity"):
             LocalReplay(spec=CHECKED, config=whole, seed=0, folder=disk / "replay")
 
 

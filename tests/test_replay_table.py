@@ -35,10 +35,12 @@ def draw(table: Table, batch_size: int, batches: int = 1) -> Sample:
     )
 
 
+# Float32, as masses are: smaller ones count as the smallest of these.
+PRIORITIES = st.floats(0, 1e3, width=32, allow_subnormal=False)
 operations = st.lists(
     st.one_of(
         st.integers(1, 7),
-        st.lists(st.tuples(st.integers(0, 60), st.floats(0, 1e3)), max_size=6),
+        st.lists(st.tuples(st.integers(0, 60), PRIORITIES), max_size=6),
     ),
     min_size=1,
     max_size=25,
@@ -68,7 +70,8 @@ def test_table_agrees_with_a_dictionary(
         assert ids.tolist() == sorted(oracle)
         masses = np.array([oracle[k] ** exponent for k in sorted(oracle)])
         expected = masses / masses.sum() if masses.sum() else masses
-        np.testing.assert_allclose(probabilities, expected, rtol=1e-9)
+        # Masses are float32.
+        np.testing.assert_allclose(probabilities, expected, rtol=1e-6)
         stored = rows.reshape(-1).view(SPEC.dtype)
         assert stored["number"].tolist() == sorted(oracle)
 
@@ -120,15 +123,15 @@ def test_stratified_batches_vary_less_than_independent_draws() -> None:
 
 
 def test_light_rows_of_a_heavy_table_are_drawn() -> None:
-    """The float64 tree resolves 1e-9 of the mass; a float32 one never draws it."""
+    """Sums in float64 resolve 1e-9 of the mass; float32 ones never draw it."""
     table = make_table(1 << 17, exponent=1.0)
     insert(table, 0, 1 << 17)
     table.update_priorities(np.arange(1 << 17), np.full(1 << 17, 0.0))
-    table.update_priorities(np.array([3, 70_000]), np.array([1.0, 1e9 - 1]))
-    positions = np.array([0.5e-9, 1e-9, 1.5e-9, 1.0])
+    table.update_priorities(np.array([3, 70_000]), np.array([1.0, 1e9]))
+    positions = np.array([0.5e-9, 0.9e-9, 1.5e-9, 1.0])
     slots, probabilities = table._selector.draw(positions, table._window)
     assert slots.tolist() == [3, 3, 70_000, 70_000]
-    np.testing.assert_allclose(probabilities[:1], 1e-9)
+    np.testing.assert_allclose(probabilities[:1], 1e-9, rtol=1e-6)
 
 
 def test_rows_without_any_priority_are_drawn_uniformly() -> None:
