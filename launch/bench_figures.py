@@ -52,13 +52,14 @@ def figures(report: Mapping[str, Any]) -> dict[str, bytes]:
     if "banks" in sections:
         drawn["banks"] = banks_figure(sections["banks"])
     return {
-        f"{name}.{kind}": _bytes(figure, kind)
+        f"{name}.{kind}": encoded(figure, kind)
         for name, figure in drawn.items()
         for kind in ("png", "svg")
     }
 
 
-def _bytes(figure: Figure, kind: str) -> bytes:
+def encoded(figure: Figure, kind: str) -> bytes:
+    """The picture as a file of this kind."""
     stream = io.BytesIO()
     extra: dict[str, Any] = {"dpi": 150}
     if kind == "svg":  # the same figures give the same file

@@ -103,7 +103,7 @@ class SimConfig:
 
 def sim_command(options: SimConfig) -> int:
     """`slipstream bench sim`."""
-    _check_outputs(options)
+    check_outputs(options.json, options.plot)
     source = source_of(options.scenes)
     report: dict[str, Any] = {
         "format": FORMAT,
@@ -149,15 +149,15 @@ def _words(scene: dict[str, Any]) -> str:
     )
 
 
-def _check_outputs(options: SimConfig) -> None:
+def check_outputs(json_path: str, plot: str) -> None:
     """Refuses what could not be written, before minutes of measuring."""
-    if options.json and options.json != "-":
-        path = Path(options.json)
+    if json_path and json_path != "-":
+        path = Path(json_path)
         if path.is_dir():
             raise LaunchError(f"--json {path}: is a folder; name a file")
         _check_writable(path.parent, f"--json {path}")
-    if options.plot:
-        _check_writable(Path(options.plot), f"--plot {options.plot}")
+    if plot:
+        _check_writable(Path(plot), f"--plot {plot}")
         if importlib.util.find_spec("matplotlib") is None:
             raise LaunchError(
                 "--plot needs matplotlib, which is not installed; "

@@ -134,6 +134,12 @@ def _bench_learner(words: list[str], prog: str) -> int:
     return bench_learner_command(_parse(BenchLearnerConfig, words, prog))
 
 
+def _replay_bench(words: list[str], prog: str) -> int:
+    from launch.bench_replay import ReplayBenchConfig, replay_command
+
+    return replay_command(_parse(ReplayBenchConfig, words, prog))
+
+
 def _doctor(words: list[str], prog: str) -> int:
     from launch.doctor import DoctorConfig, doctor_command
 
@@ -184,6 +190,7 @@ COMMANDS: Final = {
     "view": Command("shows a run in progress or a recording", _view),
     "bench sim": Command("measures the simulator", _sim),
     "bench learner": Command("measures the learner's updates", _bench_learner),
+    "bench replay": Command("measures the replay service", _replay_bench),
     "bench pipeline": Command("measures a run of the quick preset", _pipeline),
     "sweep bc": Command("clones at each point of the paper's grid", _sweep),
     "sweep dqn": Command("trains double DQN at each point of the grid", _sweep),

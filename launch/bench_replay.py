@@ -1,0 +1,160 @@
+"""`slipstream bench replay`: the replay service against its peers, on this machine.
+
+Sections, each of which can be had alone:
+
+    throughput   samples/s and CPU time per sample of 8 KB rows, over TCP and by shared
+                 memory, ours, torchrl's buffer behind our wire, and Reverb's
+
+Contestants take turns, repetition by repetition, so that what else the machine does
+hits all alike; ratios are within a repetition, then their median and least are told.
+Processes are real ones (`launch.bench_replay_runs`). Files are written at the end, each
+whole or not at all.
+"""
+
+import dataclasses
+import datetime
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+from launch import bench_replay_print, bench_replay_sections
+from launch.bench import machine
+from launch.bench_replay_runs import Contestant
+from launch.bench_replay_sections import Sizes
+from launch.bench_sim import check_outputs
+from launch.bench_timing import processor_name
+from launch.config import write_atomically
+from launch.errors import LaunchError
+from launch.tables import printer
+
+FORMAT: Final = 1
+PEER: Final = "reverb"
+PROBE_S: Final = 120.0  # for another Python to import TensorFlow
+Section = Literal["throughput"]
+ALL: Final[tuple[Section, ...]] = get_args(Section)
+SECTIONS: Final[
+    dict[str, Callable[[Sizes, Contestant | None], Iterator[dict[str, Any]]]]
+] = {
+    "throughput": bench_replay_sections.throughput,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayBenchConfig:
+    """Measures the replay service."""
+
+    sections: tuple[Section, ...] = ALL
+    """What is measured."""
+    against: str = ""
+    """A peer that is not installed beside this: reverb=PYTHON, an interpreter whose
+    environment has dm-reverb and its TensorFlow."""
+    repetitions: int = 3
+    """How often each contestant takes its turn."""
+    seconds: float = 5.0
+    """How long each turn is measured."""
+    quick: bool = False
+    """The smallest sizes, once, briefly: tries everything, measures nothing well."""
+    json: str = ""
+    """Writes everything to this file, or to standard output by -."""
+    plot: str = ""
+    """Writes the figures to this folder, as PNG and SVG."""
+
+    def __post_init__(self) -> None:
+        """Refuses sizes of nothing."""
+        if self.repetitions < 1 or not 0 < self.seconds < float("inf"):
+            raise ValueError(
+                f"--repetitions {self.repetitions} must be at least 1 and --seconds "
+                f"{self.seconds} above 0"
+            )
+
+    @property
+    def sizes(self) -> Sizes:
+        """How much is measured."""
+        if self.quick:
+            return Sizes(
+                repetitions=1,
+                seconds=0.3,
+                capacity=256,
+                min_size=128,
+            )
+        return Sizes(repetitions=self.repetitions, seconds=self.seconds)
+
+
+def replay_command(options: ReplayBenchConfig) -> int:
+    """`slipstream bench replay`."""
+    check_outputs(options.json, options.plot)
+    peer = reverb_of(options.against)
+    sizes = options.sizes
+    report: dict[str, Any] = {
+        "format": FORMAT,
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "machine": {**machine(), "processor": processor_name()},
+        "load_average": list(os.getloadavg()),
+        "sizes": dataclasses.asdict(sizes),
+        "sections": {},
+    }
+    console = printer()
+    for name in ALL:
+        if name not in options.sections:
+            continue
+        found = report["sections"][name] = list(SECTIONS[name](sizes, peer))
+        if options.json != "-":
+            for table in bench_replay_print.tables(found):
+                console.print(table)
+    _write(options, report)
+    return 0
+
+
+def reverb_of(against: str) -> Contestant | None:
+    """The peer that was asked for, after a look whether it can be run."""
+    if not against:
+        return None
+    name, _, python = against.partition("=")
+    if name != PEER or not python:
+        raise LaunchError(
+            f"--against {against}: write {PEER}=PYTHON, an interpreter that has "
+            "dm-reverb; see docs/replay_benchmarks.md"
+        )
+    if shutil.which(python) is None:
+        raise LaunchError(f"--against {against}: {python} is no program; check it")
+    try:
+        tried = subprocess.run(
+            [python, "-c", "import reverb, tensorflow"],
+            capture_output=True,
+            text=True,
+            timeout=PROBE_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise LaunchError(
+            f"--against {against}: did not import reverb within {PROBE_S:g} s"
+        ) from None
+    if tried.returncode:
+        words = tried.stderr.strip().splitlines() or [f"code {tried.returncode}"]
+        raise LaunchError(
+            f"--against {against}: cannot import reverb and tensorflow ({words[-1]}); "
+            "install 'dm-reverb[tensorflow]==0.14.0' there, on Python 3.11"
+        )
+    return Contestant(name="reverb", python=python)
+
+
+def _write(options: ReplayBenchConfig, report: dict[str, Any]) -> None:
+    if options.plot:
+        from launch.bench_replay_figures import figures
+
+        folder = Path(options.plot)
+        drawn = figures(report)
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in drawn.items():
+            write_atomically(folder / name, data)
+    text = json.dumps(report, indent=1)
+    if options.json == "-":
+        print(text)
+    elif options.json:
+        Path(options.json).parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(Path(options.json), (text + "\n").encode())

@@ -1,0 +1,91 @@
+"""The peer torchrl in `slipstream bench replay`: its buffer in the place of our table.
+
+`TensorDictPrioritizedReplayBuffer` over `LazyTensorStorage`, in batches throughout
+(one `extend` an insert, one `sample` and one `update_priority` a batch), behind our
+service: the same messages, limiter and client, so that only the tables differ. Its
+priorities are kept as given ((p + eps)^alpha, eps 1e-8), it draws independently, and
+its ids are slots: an update of a row that was overwritten meets the new one.
+"""
+
+from typing import Any, final
+
+import numpy as np
+import torch
+from jaxtyping import Float, Integer, UInt8, UInt64
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
+
+
+@final
+class TorchrlTable:
+    """What `ReplayServer` asks of a `replay.table.Table`, by torchrl's buffer."""
+
+    def __init__(self, *, capacity: int, row_bytes: int, exponent: float) -> None:
+        """An empty buffer."""
+        torch.set_num_threads(1)  # as the service's other threads need the other core
+        self._buffer: Any = TensorDictPrioritizedReplayBuffer(
+            alpha=exponent,
+            beta=0.4,
+            storage=LazyTensorStorage(capacity),
+            priority_key="td_error",
+        )
+        self._row_bytes = row_bytes
+        self.inserts = 0
+        """Rows ever inserted."""
+
+    @property
+    def size(self) -> int:
+        """Rows in the buffer."""
+        return len(self._buffer)
+
+    @property
+    def deletes(self) -> int:
+        """Rows pushed out."""
+        return self.inserts - self.size
+
+    @property
+    def memory_bytes(self) -> int:
+        """Not known: the benchmark looks at the process."""
+        return 0
+
+    def mass(self) -> float:
+        """Not asked for by one reader."""
+        return 0.0
+
+    def insert(self, rows: UInt8[np.ndarray, "rows row_bytes"], mark: object) -> None:
+        """One `extend`, which copies the rows into the storage."""
+        # A copy of its own would be one too many: the payload is read-only memory,
+        # which torch warns of and only reads here.
+        source = torch.frombuffer(bytearray(rows), dtype=torch.uint8)
+        batch = source.view(len(rows), self._row_bytes)
+        self._buffer.extend(TensorDict({"row": batch}, batch_size=[len(rows)]))
+        self.inserts += len(rows)
+
+    def draw(
+        self,
+        *,
+        batch_size: int,
+        ids: UInt64[np.ndarray, " rows"],
+        probabilities: Float[np.ndarray, " rows"],
+        rows: UInt8[np.ndarray, "rows row_bytes"],
+    ) -> None:
+        """One `sample` a batch, copied into the reply."""
+        for start in range(0, len(ids), batch_size):
+            part = slice(start, start + batch_size)
+            sample = self._buffer.sample(batch_size)
+            rows[part] = sample["row"].numpy()
+            ids[part] = sample["index"].numpy()
+            probabilities[part] = sample["priority_weight"].numpy()
+
+    def update_priorities(
+        self,
+        ids: Integer[np.ndarray, " updates"],
+        priorities: Float[np.ndarray, " priorities"],
+    ) -> int:
+        """One `update_priority`; none is known to be stale."""
+        if len(ids):
+            self._buffer.update_priority(
+                torch.from_numpy(ids.astype(np.int64)),
+                torch.from_numpy(priorities.astype(np.float32)),
+            )
+        return 0

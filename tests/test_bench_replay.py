@@ -1,0 +1,137 @@
+"""`bench replay`: its arithmetic, its options, and a run with real processes."""
+
+import json
+import os
+import re
+import stat
+from pathlib import Path
+
+import pytest
+
+from launch.bench_replay_figures import figures
+from launch.bench_replay_print import tables
+from launch.bench_replay_runs import figures as between
+from launch.bench_replay_sections import medians, ratios
+from launch.main import main
+
+
+def row(name: str, rate: float, repetition: int, *, shared: bool = False) -> dict:
+    return {
+        "contestant": name,
+        "shared_memory": shared,
+        "repetition": repetition,
+        "samples_per_s": rate,
+        "inserts_per_s": rate / 8,
+        "samples_per_insert": 8.0,
+        "cpu_us_per_sample": 30.0,
+        "cpu_us_per_sample_by": {"service": 15.0, "writers": 5.0, "reader": 10.0},
+    }
+
+
+ROWS = [
+    row("slipstream", 60.0, 0),
+    row("slipstream", 90.0, 0, shared=True),
+    row("reverb", 10.0, 0),
+    row("slipstream", 50.0, 1),
+    row("slipstream", 80.0, 1, shared=True),
+    row("reverb", 20.0, 1),
+]
+
+
+def test_ratios_are_within_a_repetition() -> None:
+    assert ratios(ROWS, False, "reverb") == [6.0, 2.5]
+    assert ratios(ROWS, True, "reverb") == [9.0, 4.0]
+    assert ratios(ROWS, True, "torchrl") == []
+
+
+def test_medians_are_per_contestant_and_link() -> None:
+    found = medians(ROWS)
+    assert [r["samples_per_s"] for r in found] == [55.0, 85.0, 15.0]
+    assert [r["repetitions"] for r in found] == [2, 2, 2]
+
+
+def test_figures_are_what_happened_between_two_looks() -> None:
+    def told(at: float, rows: float, queries: float, cpu: float) -> dict:
+        return {
+            "at": at,
+            "rows": rows,
+            "queries": queries,
+            "cpu_s": cpu,
+            "resident_bytes": 1,
+        }
+
+    first = {
+        "service-0": told(1.0, 0, 0, 2.0),
+        "service-1": told(1.0, 0, 0, 2.0),
+        "writers": told(1.0, 100, 10, 1.0),
+        "reader": told(1.0, 500, 5, 3.0),
+    }
+    last = {
+        "service-0": told(3.0, 0, 0, 3.0),
+        "service-1": told(3.0, 0, 0, 2.5),
+        "writers": told(3.0, 300, 14, 1.1),
+        "reader": told(3.0, 2100, 30, 3.4),
+    }
+    found = between(first, last)
+    assert found["samples_per_s"] == 800.0
+    assert found["inserts_per_s"] == 100.0
+    assert found["samples_per_insert"] == 8.0
+    assert found["cores"] == pytest.approx(
+        {"service": 0.75, "writers": 0.05, "reader": 0.2}
+    )
+    assert found["cpu_us_per_sample"] == pytest.approx(1e6 / 800)
+
+
+def test_the_bars_are_drawn() -> None:
+    drawn = figures({"sections": {"throughput": ROWS}})
+    assert drawn["replay_throughput.png"].startswith(b"\x89PNG")
+    assert [table.row_count for table in tables(ROWS)] == [3, 2]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--against", "reverb"], "write reverb=PYTHON"),
+        (["--against", "reverb=/nowhere/python"], "is no program"),
+        (["--sections", "speed"], "speed"),
+        (["--repetitions", "0"], "at least 1"),
+        (["--json", f"{__file__}/f.json"], "is not a folder"),
+    ],
+)
+def test_mistakes_are_one_line_before_anything_is_measured(
+    words: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "replay", *words]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "\n" not in said
+    assert re.search(line, said), said
+
+
+def test_a_python_without_reverb_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    python = tmp_path / "python"
+    python.write_text("#!/bin/sh\necho \"No module named 'reverb'\" >&2\nexit 1\n")
+    python.chmod(python.stat().st_mode | stat.S_IXUSR)
+    assert main(["bench", "replay", "--against", f"reverb={python}"]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "No module named 'reverb'" in said and "\n" not in said
+
+
+@pytest.mark.slow
+def test_ours_and_torchrl_with_real_processes(tmp_path: Path) -> None:
+    file = tmp_path / "f.json"
+    words = ["--quick", "--sections", "throughput", "--json", str(file)]
+    assert main(["bench", "replay", *words]) == 0
+    found = json.loads(file.read_text())["sections"]["throughput"]
+    assert [(r["contestant"], r["shared_memory"]) for r in found] == [
+        ("slipstream", False),
+        ("slipstream", True),
+        ("torchrl", False),
+        ("torchrl", True),
+    ]
+    for measured in found:
+        assert measured["samples_per_s"] > 0
+        assert 4.0 < measured["samples_per_insert"] < 16.0  # of a short window
+        assert min(measured["cores"].values()) >= 0.0
+    assert not [f for f in os.listdir(tmp_path) if f != "f.json"]
