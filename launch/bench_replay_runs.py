@@ -25,7 +25,7 @@ from typing import Any, Final, Literal, final
 import psutil
 
 from launch.errors import LaunchError
-from launch.train import free_port
+from launch.join import free_port
 
 Name = Literal["slipstream", "torchrl", "reverb"]
 START_S: Final = 90.0  # for a process to say that it works
