@@ -1,9 +1,9 @@
 """Which slots of the ring are drawn: in proportion to priority, or uniformly.
 
-Rows lie in a ring; those in the table are a window of it (`Window`). Masses are float32
-and their sums float64 (`replay.sum_tree`), and the probabilities told are those of these
-masses: a float32 target near 10^6 would move in steps of 0.06, so that light rows could
-not be drawn at all, while a rounded mass only is another mass.
+Rows lie in a ring; those in the table are a window of it (`Window`). Masses are
+float32 and their sums float64 (`replay.sum_tree`), and the probabilities told are those
+of these masses: a float32 target near 10^6 would move in steps of 0.06, so that light
+rows could not be drawn at all, while a rounded mass only is another mass.
 """
 
 import abc

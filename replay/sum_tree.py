@@ -7,10 +7,10 @@ capacity.
 
 `find` gives the definition's answer: the first slot at which the running sum of the
 masses reaches the target. Downwards, a whole batch takes one level at a time: gather
-each target's block, multiply it by a triangular matrix of ones (the sums of what stands
-before each child), and go to the last child whose sum is below the target. The product
-may add in any order, so a target within rounding of a boundary may end at a leaf without
-mass; such a one goes down again by itself, with sums that are monotone.
+each target's block, multiply it by a triangular matrix of ones (the sums of what
+stands before each child), and go to the last child whose sum is below the target. The
+product may add in any order, so a target within rounding of a boundary may end at a
+leaf without mass; such a one goes down again by itself, with sums that are monotone.
 
 16 and 256 are measured: with 64 to a block a draw costs twice as much (the sums within
 blocks are the work), and a larger top costs more to add up than a level.
@@ -56,7 +56,8 @@ class SumTree:
             kind = np.float32 if level == height else np.float64
             self._levels.append(np.zeros((nodes * _FAN ** (level - 1), _FAN), kind))
         self._top = np.zeros(nodes, np.float64 if height else np.float32)
-        self._leaves = self._levels[0].reshape(-1) if self._levels else self._top
+        bottom = self._levels[0].reshape(-1) if self._levels else self._top
+        self._leaves: Float32[np.ndarray, " slots"] = bottom
         self._sums = np.zeros(nodes + 1)  # what stands before each node of the top
         self._above = [level.reshape(-1) for level in self._levels[1:]]
         self._above += [self._top] if self._levels else []
