@@ -117,7 +117,7 @@ class ShardClaim:
 
     def _refuse_if(self, key: str) -> None:
         mine = self._keys.claim(self.incarnation)
-        found = [k for k in _alive(self._hub, key) if k != mine]
+        found = [k for k in alive(self._hub, key) if k != mine]
         if found:
             raise ReplayError(
                 f"run {self._keys.run_id} has a shard {self._keys.shard} already; "
@@ -152,7 +152,7 @@ class ShardClaim:
         self._declared = []
 
 
-def _alive(session: zenoh.Session, key: str) -> list[str]:
+def alive(session: zenoh.Session, key: str) -> list[str]:
     """Keys of the tokens there are."""
     replies = session.liveliness().get(key, timeout=_ANSWER_S)
     return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
@@ -168,7 +168,7 @@ def life_of(key: str) -> tuple[int, int] | None:
 
 def live_shards(session: zenoh.Session, keys: RunKeys) -> list[int]:
     """Numbers of the shards that the hub knows to be up."""
-    lives = [life_of(key) for key in _alive(session, keys.all_lives)]
+    lives = [life_of(key) for key in alive(session, keys.all_lives)]
     return sorted({life[0] for life in lives if life is not None})
 
 
@@ -220,7 +220,9 @@ class ShardLink:
         self.session = session
         self.endpoints = endpoints
         self._owned = owned
+        self._lock = threading.Lock()
         self._lives: tuple[int, ...] = ()
+        self._heard = 0  # events
         self._on_change = on_change
         self._subscriber = session.liveliness().declare_subscriber(
             keys.lives, self._on_token, history=True
@@ -237,13 +239,25 @@ class ShardLink:
         return self._lives[0] if self._lives else None
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        life = life_of(str(sample.key_expr))
-        if life is None or life[0] != self.shard:
-            return
-        others = tuple(one for one in self._lives if one != life[1])
-        born = sample.kind == zenoh.SampleKind.PUT
-        self._lives = (*others, life[1])[:4] if born else others
+        with self._lock:
+            self._heard += 1
+            self._take(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
         self._on_change()
+
+    def _take(self, key: str, born: bool) -> None:
+        life = life_of(key)
+        if life is not None and life[0] == self.shard:
+            others = tuple(one for one in self._lives if one != life[1])
+            self._lives = (*others, life[1])[:4] if born else others
+
+    def look(self) -> None:
+        """Takes up a process that serves though no event has told so."""
+        heard = self._heard
+        for key in alive(self.session, self.keys.lives) if not self._lives else ():
+            with self._lock:
+                if self._heard == heard:  # or what was found may be over already
+                    self._take(key, True)
+            self._on_change()
 
     def close(self) -> None:
         """Ends the session if it is the link's own."""

@@ -2,11 +2,13 @@
 
 One thread does what can block (asking a shard how it is reached, opening sessions);
 Zenoh's callbacks only enqueue. What was heard of a shard stays when the hub forgets it:
-its link tells whether it is there.
+its link tells whether it is there. A shard that does not answer yet is asked again, and
+every 10 s the thread looks at what there is: what is known does not hang on any event.
 """
 
 import queue
 import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Final, final
 
@@ -18,6 +20,7 @@ from replay.session import ConnectError, ask, check_endpoints, open_session, und
 from replay.shards import (
     Announcement,
     ShardLink,
+    alive,
     check_announcement,
     life_of,
     reachable,
@@ -27,6 +30,7 @@ from replay.spec import ReplayError, RowSpec
 _ANSWER_S: Final = 2.0  # for a shard to say how it is reached
 _OPEN_S: Final = 3.0
 _RETRY_S: Final = 0.5  # between two attempts to reach what is announced
+_LOOK_S: Final = 10.0  # between two looks at what there is
 _MOST: Final = 256  # shards, and a life each, that are taken up
 
 
@@ -113,18 +117,43 @@ class ShardDirectory:
             listener()
 
     def _run_thread(self) -> None:
+        look_at = time.monotonic() + _LOOK_S
         while not self._closing.is_set():
-            again = bool(self._open) or self._missing()
+            wait = max(0.0, look_at - time.monotonic())
+            if self._open or self._missing():
+                wait = min(wait, _RETRY_S)
             try:
-                event = self._events.get(timeout=_RETRY_S if again else None)
+                self._round(self._events.get(timeout=wait))
             except queue.Empty:
-                event = None
-            if event is not None:
-                self._take(*event)
-            elif not self._closing.is_set():
-                for key in list(self._open.values()):
+                self._round(None)
+            if time.monotonic() >= look_at:
+                self._look()
+                look_at = time.monotonic() + _LOOK_S
+
+    def _round(self, event: tuple[str, bool] | None) -> None:
+        """Takes one event, or asks again who did not answer; links what is to be."""
+        if event is not None:
+            self._take(*event)
+        else:
+            for key in list(self._open.values()):
+                if not self._closing.is_set():
                     self._ask(key)
-            self._reach()
+        self._reach()
+
+    def _look(self) -> None:
+        """Takes up what the hub and the shards know and no event has told."""
+        keys = alive(self._session, RunKeys(self._run).all_lives)
+        found = {life: key for key in keys if (life := life_of(key)) is not None}
+        known = set(self._announced.items())
+        # Nothing at all is a hub that is silent, not one that has no shard.
+        for shard, incarnation in known - found.keys() if found else ():
+            self._take(RunKeys(self._run, shard).life(incarnation), False)
+        for life in found.keys() - known - self._open.keys():
+            self._take(found[life], True)
+        self._reach()
+        for link in list(self._links.values()):
+            if not self._closing.is_set():
+                link.look()
 
     def _take(self, key: str, up: bool) -> None:
         """A life began or ended, as the hub sees it."""
@@ -190,7 +219,8 @@ class ShardDirectory:
                 link.close()
                 link = None
                 self._changed()
-            if link is None and self._is_wanted(shard) and shard in self._announced:
+            wanted = self._is_wanted(shard) and shard in self._announced
+            if link is None and wanted and not self._closing.is_set():
                 self._link(shard, endpoints)
 
     def _link(self, shard: int, endpoints: tuple[str, ...]) -> None:
@@ -210,6 +240,8 @@ class ShardDirectory:
         )
         with self._lock:
             self._links[shard] = link
+        # What the link heard until here it said while nobody could find it.
+        self._changed()
 
 
 def _open(endpoints: tuple[str, ...], insecure: bool) -> zenoh.Session:
