@@ -122,7 +122,8 @@ def decode(payload: bytes, kind: type[MessageT]) -> MessageT:
     """Parses and validates; raises `WireError`, never a half-read message."""
     try:
         message = msgspec.msgpack.decode(payload, type=kind)
-    except (msgspec.DecodeError, RecursionError) as error:
+    # msgspec decodes the names of fields as text before it looks at them.
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise WireError(f"{kind.__name__}: {error}") from error
     if message.version != WIRE_VERSION:
         raise WireError(

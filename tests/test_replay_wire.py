@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from replay import control
@@ -292,6 +292,7 @@ def test_fuzzed_messages_decode_or_raise(name: str, data: st.DataObject) -> None
 
 
 @given(payload=st.binary(max_size=80))
+@example(payload=b"\xde\x00\x01\xa1\x80")  # a field whose name is not UTF-8
 def test_fuzzed_small_messages_decode_or_raise(payload: bytes) -> None:
     for message in SMALL_MESSAGES:
         try:
