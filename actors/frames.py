@@ -133,7 +133,7 @@ def decode_frames(payload: bytes) -> FrameBatch:
     """Reads a message whole; raises `FrameError` for anything else."""
     try:
         message = msgspec.msgpack.decode(payload, type=_Message)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FrameError(f"frames: {error}") from error
     if message.version != FRAMES_VERSION:
         raise FrameError(

@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from actors.frames import (
@@ -145,6 +145,7 @@ def test_no_part_of_a_message_is_a_message() -> None:
 
 
 @given(st.binary(max_size=300))
+@example(b"\xde\x00\x01\xa1\x80")  # a field whose name is not UTF-8
 def test_noise_is_refused(noise: bytes) -> None:
     with pytest.raises(FrameError):
         decode_frames(noise)
