@@ -141,6 +141,7 @@ def rounded(
     no share is of more.
     """
     places = np.floor(np.cumsum(shares) * batch_size + offset).astype(np.int64)
+    places = np.minimum(places, batch_size)  # an offset just below 1 is rounded up
     places[-1] = batch_size
     counts = np.diff(places, prepend=0)
     while (lacking := counts > rows).any():  # the last bit of a sum
