@@ -251,7 +251,7 @@ def filler_role(join: JoinConfig, stop: threading.Event) -> None:
             )
         status = StatusPublisher(place.session, place.keys, "filler")
         directory = place.directory(row_spec_of(place.run))
-        parts = _dealt(rows, place.run.config.shards)
+        parts = dealt(rows, place.run.config.shards)
         while not stop.is_set():
             lacking = _lacking(place, parts)
             if lacking:
@@ -261,7 +261,7 @@ def filler_role(join: JoinConfig, stop: threading.Event) -> None:
         directory.close()
 
 
-def _dealt(rows: np.ndarray, shards: int) -> dict[int, np.ndarray]:
+def dealt(rows: np.ndarray, shards: int) -> dict[int, np.ndarray]:
     """What each shard holds of the pass: as many rows, one scene's in all of them."""
     return {shard: rows[shard::shards] for shard in range(shards)}
 

@@ -131,7 +131,7 @@ def _serve_shard(join: JoinConfig, options: ShardConfig, stop: threading.Event) 
 
 
 def _settings(config: ExperimentConfig, options: ShardConfig) -> ReplayConfig:
-    replay = config.replay.part_of(config.shards)
+    replay = config.replay.part_of(config.shards, options.shard)
     return dataclasses.replace(replay, durable=True) if options.durable else replay
 
 

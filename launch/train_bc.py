@@ -131,12 +131,9 @@ def clone_serially(folder: Path, run: RunFile) -> None:
 
     def saved() -> None:
         nonlocal due
-        if judge is None or time.monotonic() < due:
-            return
-        due = time.monotonic() + config.evaluator.seconds
-        judged = judge.look(config.evaluator.updates)
-        if judged is not None:
-            say(_line(judged, reporter.elapsed_s))
+        if time.monotonic() >= due:
+            due = time.monotonic() + config.evaluator.seconds
+            _look(judge, reporter, config.evaluator.updates)
 
     reporter = CloneReporter(
         learner=learner, config=config, folder=folder, before_s=before_s, saved=saved
@@ -153,8 +150,18 @@ def clone_serially(folder: Path, run: RunFile) -> None:
         if spent(config, learner.updates, reporter.elapsed_s):
             break
     reporter.close()
+    _look(judge, reporter, 0)
     if judge is not None:
         judge.close()
+
+
+def _look(
+    judge: CheckpointJudge | None, reporter: CloneReporter, least_updates: int
+) -> None:
+    """Judges the newest checkpoint if it is to be, and says how it did."""
+    judged = judge.look(least_updates) if judge is not None else None
+    if judged is not None:
+        say(_line(judged, reporter.elapsed_s))
 
 
 def _line(judged: Judgement, elapsed_s: float) -> str:

@@ -73,16 +73,18 @@ class ReplayConfig:
             max_times_sampled=self.max_times_sampled,
         )
 
-    def part_of(self, shards: int) -> "ReplayConfig":
+    def part_of(self, shards: int, shard: int = 0) -> "ReplayConfig":
         """The settings of one of so many shards.
 
-        Capacity and minimum are shared out. The limiter's tolerance, in samples, is
-        not: each shard has to let the same batches pass as one table would.
+        Capacity and minimum are shared out; the first shards have room for what is
+        left over. The limiter's tolerance, in samples, is not shared out: each shard
+        has to let the same batches pass as one table would.
         """
+        capacity, rest = divmod(self.capacity, shards)
         min_size = max(1, self.min_size // shards)
         return replace(
             self,
-            capacity=-(-self.capacity // shards),
+            capacity=max(1, capacity + (shard < rest)),
             min_size=min_size,
             tolerance=self.tolerance * self.min_size / min_size,
         )

@@ -40,6 +40,7 @@ from replay.wire import Insert, InsertReply, Status, WireError
 _ANSWER_MARGIN_S = 5.0  # between the service's last moment to answer and giving up
 _BACK_OFF_S = (0.02, 1.0)  # first and longest
 _GAP_PAUSE_S = 0.005
+_END_S = 1.0  # that is waited for the sending thread
 
 
 @final
@@ -157,7 +158,8 @@ class Writer:
             with self._changed:
                 self._closed = True
                 self._changed.notify_all()
-            self._thread.join()
+            # A link whose other end stands still holds a sender for up to a minute.
+            self._thread.join(_END_S)
 
     def _raise_error(self) -> None:
         if self._error is not None:
