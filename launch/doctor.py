@@ -102,18 +102,18 @@ def memory() -> Finding:
     return Finding("memory", "ok", f"{free:.1f} GB free")
 
 
-def shared_memory_size() -> Finding:
-    """/dev/shm, which Zenoh's shared memory comes from."""
-    path = Path("/dev/shm")
-    if not path.is_dir():
-        return Finding(
-            "/dev/shm", "warning", "missing", "messages go by TCP, which is slower"
-        )
-    free = shutil.disk_usage(path).free / 1e6
-    if free < 256:
-        advice = "give the container more, e.g. docker run --shm-size=1g"
-        return Finding("/dev/shm", "warning", f"{free:.0f} MB free", advice)
-    return Finding("/dev/shm", "ok", f"{free:,.0f} MB free")
+def shared_memory() -> Finding:
+    """Memory that a replay service on this machine answers into (`replay.arena`)."""
+    from replay.arena import Arenas, make_arena
+
+    name, advice = "shared memory", "samples go by TCP, which is slower"
+    arena = make_arena(parts=1, part_bytes=_VALUES)
+    place = arena.take() if arena is not None else None
+    if place is None:
+        return Finding(name, "warning", "no sealed anonymous files here", advice)
+    if Arenas().part(place, _VALUES) is None:
+        return Finding(name, "warning", "/proc hides other processes' files", advice)
+    return Finding(name, "ok", "a service of this machine answers into it")
 
 
 def disk() -> Finding:
@@ -147,19 +147,17 @@ def ports() -> Finding:
     return Finding("ports", "ok", f"{_free_port()} is free, so are 9090 and 9876")
 
 
-def zenoh_loopback(shared_memory: bool) -> Finding:
+def zenoh_loopback() -> Finding:
     """Weights of 1 MB published by one session and had by another."""
     from replay.keys import RunKeys
     from replay.session import open_session
     from replay.weights import WeightsPublisher, WeightsSubscriber
 
-    name = "zenoh, shared memory" if shared_memory else "zenoh, tcp"
+    name = "zenoh"
     endpoint, keys = f"tcp/127.0.0.1:{_free_port()}", RunKeys("doctor")
     with (
-        open_session(
-            listen=[endpoint], router=True, shared_memory=shared_memory
-        ) as router,
-        open_session(connect=[endpoint], shared_memory=shared_memory) as client,
+        open_session(listen=[endpoint], router=True) as router,
+        open_session(connect=[endpoint]) as client,
     ):
         publisher = WeightsPublisher(session=router, keys=keys)
         publisher.publish(version=0, layout_hash="doctor", vector=np.zeros(_VALUES))
@@ -185,7 +183,7 @@ def torch_devices() -> Finding:
     try:
         import torch
     except ImportError:
-        advice = "only replay and learner need it: pip install 'slipstream[learner]'"
+        advice = "only the learner needs it: pip install 'slipstream[learner]'"
         return Finding("torch", "warning", "not installed", advice)
     count = torch.cuda.device_count()
     names = ", ".join(torch.cuda.get_device_name(index) for index in range(count))
@@ -212,11 +210,10 @@ CHECKS: Final[tuple[tuple[str, Callable[[], Finding]], ...]] = (
     ("packages", packages),
     ("cores", cores),
     ("memory", memory),
-    ("/dev/shm", shared_memory_size),
+    ("shared memory", shared_memory),
     ("disk", disk),
     ("ports", ports),
-    ("zenoh, tcp", lambda: zenoh_loopback(False)),
-    ("zenoh, shared memory", lambda: zenoh_loopback(True)),
+    ("zenoh", zenoh_loopback),
     ("jax", jax_devices),
     ("torch", torch_devices),
     ("rerun", rerun),
