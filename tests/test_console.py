@@ -128,7 +128,7 @@ def test_the_doctor_finds_this_machine_fit() -> None:
     """What the tests need, the doctor must find; a Zenoh round trip among it."""
     cheap = [one for one in CHECKS if one[0] not in {"jax", "torch"}]
     findings = [examine(name, check) for name, check in cheap]
-    assert len(findings) == 10
+    assert [finding.check for finding in findings] == [name for name, _ in cheap]
     assert not [finding for finding in findings if finding.verdict == "error"]
     assert all(finding.advice for finding in findings if finding.verdict != "ok")
 
