@@ -33,6 +33,7 @@ PACKAGES: Final = {
     "tensorboard": "learner",
     "matplotlib": "learner",
     "rerun-sdk": "viewer",
+    "prometheus-client": "metrics",
 }
 _VALUES: Final = 1 << 18  # float32, large enough to go by shared memory
 

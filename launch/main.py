@@ -158,6 +158,12 @@ def _replay_stats(words: list[str], prog: str) -> int:
     return stats_command(_parse(StatsConfig, words, prog))
 
 
+def _metrics(words: list[str], prog: str) -> int:
+    from launch.metrics import MetricsConfig, metrics_command
+
+    return metrics_command(_parse(MetricsConfig, words, prog))
+
+
 def _export(words: list[str], prog: str) -> int:
     from launch.export import ExportConfig, export_command
 
@@ -196,6 +202,7 @@ COMMANDS: Final = {
     "sweep dqn": Command("trains double DQN at each point of the grid", _sweep),
     "sweep all": Command("both grids, and one table of both", _sweep),
     "replay stats": Command("says how a run's replay fares", _replay_stats),
+    "replay metrics": Command("serves the same to Prometheus", _metrics),
     "replay export": Command("writes a replay to a file for offline RL", _export),
     "replay": Command("one role of a run: the replay service", _role),
     "actor": Command("one role of a run: an actor", _role),
