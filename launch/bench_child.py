@@ -26,7 +26,8 @@ ONE_THREAD: Final = {
     "OPENBLAS_NUM_THREADS": "1",
 }
 PATIENCE_S: Final = 10.0  # for a child that was interrupted
-CPU_ONLY: Final = frozenset({"steps", "scale", "bank"})  # whatever else JAX finds
+# Whatever else JAX finds.
+CPU_ONLY: Final = frozenset({"steps", "scale", "bank", "rendering"})
 
 
 def run(

@@ -4,6 +4,7 @@ Sections, each of which can be had alone:
 
     throughput   samples/s and CPU time per sample of 8 KB rows, over TCP and by shared
                  memory, ours, torchrl's buffer behind our wire, and Reverb's
+    rows         the project's own rows of 128 bytes, and rendering their observations
 
 Contestants take turns, repetition by repetition, so that what else the machine does
 hits all alike; ratios are within a repetition, then their median and least are told.
@@ -11,11 +12,13 @@ Processes are real ones (`launch.bench_replay_runs`). Files are written at the e
 whole or not at all.
 """
 
+import contextlib
 import dataclasses
 import datetime
 import json
 import os
 import shutil
+import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -35,12 +38,13 @@ from launch.tables import printer
 FORMAT: Final = 1
 PEER: Final = "reverb"
 PROBE_S: Final = 120.0  # for another Python to import TensorFlow
-Section = Literal["throughput"]
+Section = Literal["throughput", "rows"]
 ALL: Final[tuple[Section, ...]] = get_args(Section)
 SECTIONS: Final[
     dict[str, Callable[[Sizes, Contestant | None], Iterator[dict[str, Any]]]]
 ] = {
     "throughput": bench_replay_sections.throughput,
+    "rows": bench_replay_sections.rows,
 }
 
 
@@ -55,8 +59,10 @@ class ReplayBenchConfig:
     environment has dm-reverb and its TensorFlow."""
     repetitions: int = 3
     """How often each contestant takes its turn."""
-    seconds: float = 5.0
+    seconds: float = 3.0
     """How long each turn is measured."""
+    batches_per_reply: int = 4
+    """Batches in one reply of our service; section throughput measures 1 as well."""
     quick: bool = False
     """The smallest sizes, once, briefly: tries everything, measures nothing well."""
     json: str = ""
@@ -71,6 +77,10 @@ class ReplayBenchConfig:
                 f"--repetitions {self.repetitions} must be at least 1 and --seconds "
                 f"{self.seconds} above 0"
             )
+        if self.batches_per_reply < 1:
+            raise ValueError(
+                f"--batches-per-reply {self.batches_per_reply} must be at least 1"
+            )
 
     @property
     def sizes(self) -> Sizes:
@@ -81,8 +91,14 @@ class ReplayBenchConfig:
                 seconds=0.3,
                 capacity=256,
                 min_size=128,
+                batches_per_reply=self.batches_per_reply,
+                scenes=1,
             )
-        return Sizes(repetitions=self.repetitions, seconds=self.seconds)
+        return Sizes(
+            repetitions=self.repetitions,
+            seconds=self.seconds,
+            batches_per_reply=self.batches_per_reply,
+        )
 
 
 def replay_command(options: ReplayBenchConfig) -> int:
@@ -99,15 +115,26 @@ def replay_command(options: ReplayBenchConfig) -> int:
         "sections": {},
     }
     console = printer()
-    for name in ALL:
-        if name not in options.sections:
-            continue
-        found = report["sections"][name] = list(SECTIONS[name](sizes, peer))
-        if options.json != "-":
-            for table in bench_replay_print.tables(found):
-                console.print(table)
+    with _interruptible():
+        for name in ALL:
+            if name not in options.sections:
+                continue
+            found = report["sections"][name] = list(SECTIONS[name](sizes, peer))
+            if options.json != "-":
+                for table in bench_replay_print.tables(name, found):
+                    console.print(table)
     _write(options, report)
     return 0
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM ends as Ctrl-C does: no process and no file stays behind."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def reverb_of(against: str) -> Contestant | None:

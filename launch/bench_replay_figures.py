@@ -38,7 +38,7 @@ def _blank(title: str) -> Figure:
 def throughput_figure(rows: Sequence[Row]) -> Figure:
     """Samples/s, each repetition a dot, and CPU time per sample by process."""
     figure = _blank(
-        "8 KB rows, 8 samples per insert, batches of 64, priorities updated"
+        "8 KB rows, 8 samples per insert; in brackets: batches of 64 in a reply"
     )
     rates, costs = figure.subplots(1, 2, sharey=True)
     found = medians(rows)
@@ -50,6 +50,7 @@ def throughput_figure(rows: Sequence[Row]) -> Figure:
             for other in rows
             if other["contestant"] == row["contestant"]
             and other["shared_memory"] == row["shared_memory"]
+            and other["batches_per_reply"] == row["batches_per_reply"]
         ]
         rates.plot(each, [place] * len(each), "k.", markersize=5)
         start = 0.0
@@ -60,6 +61,7 @@ def throughput_figure(rows: Sequence[Row]) -> Figure:
             start += width
     labels = [
         f"{row['contestant']}\n{'shared memory' if row['shared_memory'] else 'TCP'}"
+        f" ({row['batches_per_reply']})"
         for row in found
     ]
     rates.set_yticks(range(len(found)), labels)

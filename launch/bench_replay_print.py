@@ -9,15 +9,29 @@ from rich.table import Table
 from launch.bench_replay_sections import medians, ratios
 
 Row = Mapping[str, Any]
-WANTED: Final = {("reverb", False): 5.0, ("reverb", True): 8.0}
-WANTED_TORCHRL: Final = {("torchrl", False): 2.5, ("torchrl", True): 4.0}
+# Peer, ours by shared memory, the peer by shared memory: how many times.
+WANTED: Final = {
+    ("reverb", False, False): 5.0,
+    ("reverb", True, False): 8.0,
+    ("torchrl", False, False): 2.5,
+    ("torchrl", True, False): 4.0,
+    ("torchrl", True, True): 4.0,
+}
+WANTED_ROWS: Final = {("reverb", False, False): 15.0, ("reverb", True, False): 15.0}
 KINDS: Final = ("service", "writers", "reader")
 
 
-def tables(rows: Sequence[Row]) -> Iterator[Table]:
+def tables(section: str, rows: Sequence[Row]) -> Iterator[Table]:
     """All of a section."""
-    yield _rates("8 KB rows, 8 samples per insert, batches of 64", rows)
-    yield _ratios(rows)
+    if section == "throughput":
+        yield _rates("8 KB rows, 8 samples per insert, batches of 64", rows)
+        yield _ratios(rows, WANTED)
+    else:
+        sampled = [row for row in rows if row["what"] == "sampled"]
+        yield _rates("Rows of 128 bytes, a peer's of 8 KB", sampled)
+        if any(row["contestant"] == "reverb" for row in sampled):
+            yield _ratios(sampled, WANTED_ROWS)
+        yield _rendering(rows)
 
 
 def _table(title: str, *columns: str, caption: str = "") -> Table:
@@ -27,19 +41,28 @@ def _table(title: str, *columns: str, caption: str = "") -> Table:
     return table
 
 
-def _link(row: Row) -> str:
-    return "shared memory" if row["shared_memory"] else "TCP"
+def _link(shared_memory: bool) -> str:
+    return "shared memory" if shared_memory else "TCP"
 
 
 def _rates(title: str, rows: Sequence[Row]) -> Table:
-    columns = ("contestant", "link", "samples/s", "inserts/s", "CPU us/sample", *KINDS)
+    columns = (
+        "contestant",
+        "link",
+        "batches",
+        "samples/s",
+        "inserts/s",
+        "CPU us/sample",
+        *KINDS,
+    )
     table = _table(
-        f"{title}: medians", *columns, caption="CPU time of all processes per sample"
+        f"{title}: medians", *columns, caption="Batches in a reply; CPU time of all"
     )
     for row in medians(rows):
         table.add_row(
             row["contestant"],
-            _link(row),
+            _link(row["shared_memory"]),
+            str(row["batches_per_reply"]),
             f"{row['samples_per_s']:,.0f}",
             f"{row['inserts_per_s']:,.0f}",
             f"{row['cpu_us_per_sample']:.1f}",
@@ -48,7 +71,9 @@ def _rates(title: str, rows: Sequence[Row]) -> Table:
     return table
 
 
-def _ratios(rows: Sequence[Row]) -> Table:
+def _ratios(
+    rows: Sequence[Row], targets: Mapping[tuple[str, bool, bool], float]
+) -> Table:
     table = _table(
         "Our samples/s over a peer's, repetition by repetition",
         "peer",
@@ -57,14 +82,37 @@ def _ratios(rows: Sequence[Row]) -> Table:
         "least",
         "wanted",
     )
-    for (peer, shared), wanted in {**WANTED, **WANTED_TORCHRL}.items():
-        found = ratios(rows, shared, peer)
+    for (peer, ours, theirs), wanted in targets.items():
+        found = ratios(rows, ours, peer, theirs)
         if found:
             table.add_row(
-                f"{peer}, TCP",
-                "shared memory" if shared else "TCP",
+                f"{peer}, {_link(theirs)}",
+                _link(ours),
                 f"{statistics.median(found):.2f}",
                 f"{min(found):.2f}",
                 f"{wanted:g}",
             )
     return table
+
+
+def _rendering(rows: Sequence[Row]) -> Table:
+    table = _table(
+        "Observations rendered on one core",
+        "what",
+        "observations/s",
+        "CPU us/observation",
+        "wanted/s",
+        caption="Medians; CPU time of the process that renders",
+    )
+    for what in ("rendered", "sampled and rendered"):
+        same = [row for row in rows if row["what"] == what]
+        cost = [row.get("cpu_us_per_observation") or _reader_us(row) for row in same]
+        rates = statistics.median(row["observations_per_s"] for row in same)
+        table.add_row(
+            what, f"{rates:,.0f}", f"{statistics.median(cost):.1f}", "100,000"
+        )
+    return table
+
+
+def _reader_us(row: Row) -> float:
+    return float(row["cpu_us_per_sample_by"]["reader"]) / 2

@@ -2,7 +2,8 @@
 
 `python -m launch.bench_replay_roles REQUEST`: ours, and torchrl's buffer behind the
 same wire (`launch.bench_replay_torchrl`). Every reader reads every byte that it is
-given, and sets the priority of every row. Rows are noise, which nothing compresses.
+given, and sets the priority of every row. Rows are noise, which nothing compresses, or
+transitions of a bank, which can be rendered.
 
 Several writers share a process, each with a thread and a number of its own: a hundred
 processes would measure the scheduler of a small machine. Several shards are dealt out
@@ -11,7 +12,9 @@ turn, and there is a session for each.
 """
 
 import itertools
+import os
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final, cast
@@ -33,7 +36,11 @@ ROUNDS: Final = 16  # different batches of a writer
 
 
 def spec_of(load: Request) -> RowSpec:
-    """Rows of noise."""
+    """Rows of noise, or the project's own with so many steps of history."""
+    if load["history"]:
+        from actors.rows import row_spec
+
+        return row_spec(load["history"])
     return RowSpec((Field("noise", "u8", (load["row_bytes"] // 8,)),))
 
 
@@ -147,6 +154,10 @@ def _sessions(wanted: Request, stack: ExitStack) -> list[Any]:
 def _rows(load: Request, spec: RowSpec) -> np.ndarray:
     """What a writer sends, over and over: `ROUNDS` batches."""
     count = ROUNDS * load["insert_rows"]
+    if load["bank"]:
+        from launch.bench_replay_rows import bank_rows
+
+        return bank_rows(Path(load["bank"]), spec, count)
     random = np.random.default_rng(0)
     noise = random.integers(0, 255, count * spec.row_bytes, np.uint8)
     return noise.view(spec.dtype)
@@ -178,11 +189,12 @@ def _write(
 
 
 def reader(wanted: Request) -> None:
-    """Samples, reads every byte and sets every priority."""
+    """Samples, reads every byte (or renders) and sets every priority."""
     load = wanted["workload"]
     spec = spec_of(load)
     counts = Counts()
     line = Line(counts.all)
+    use = _use(wanted)
     random = np.random.default_rng(0)
     share = 1.0 / load["batches_per_reply"]
     with ExitStack() as stack:
@@ -200,7 +212,7 @@ def reader(wanted: Request) -> None:
         while not line.ended.is_set():
             for sampler in samplers:
                 sample = sampler.sample(PATIENCE_S)
-                sample.rows.view(np.uint64).sum()
+                use(sample.rows)
                 new = random.random(len(sample.ids))
                 sampler.update_priorities(sample.ids, new)
                 first = counts.rows == 0
@@ -209,9 +221,20 @@ def reader(wanted: Request) -> None:
                     line.ready()
 
 
+def _use(wanted: Request) -> Callable[[np.ndarray], object]:
+    """What is done with a batch."""
+    if not wanted["render"]:
+        return lambda rows: int(rows.view(np.uint64).sum())
+    from launch.bench_replay_rows import renderer
+
+    load = wanted["workload"]
+    return renderer(Path(load["bank"]), wanted["render"], rows=load["batch_size"])
+
+
 def main() -> None:
     """One process."""
     wanted = request()
+    os.sched_setaffinity(0, wanted["cores"])
     {"service": service, "writers": writers, "reader": reader}[wanted["role"]](wanted)
 
 

@@ -24,6 +24,7 @@ from typing import Any, Final, Literal, final
 
 import psutil
 
+from launch.bench_child import ONE_THREAD
 from launch.errors import LaunchError
 from launch.join import free_port
 
@@ -48,8 +49,10 @@ class Workload:
     capacity: int = 20_000
     exponent: float = 0.6
     durable: bool = False
-    batches_per_reply: int = 1
+    batches_per_reply: int = 4
     in_flight: int = 2
+    history: int = 0  # above 0: the project's own rows, of the bank named here
+    bank: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,19 +75,25 @@ class Crew:
 
     shards: int = 1
     writers: int = 1
+    reader: bool = True
+    render: str = ""  # the preset whose observations the reader renders
+    one_core: bool = False  # the reader alone on the last core, all else on the others
 
 
 @final
 class Child:
     """A process that answers by lines; see `launch.bench_replay_lines`."""
 
-    def __init__(self, *, kind: str, command: Sequence[str], folder: Path) -> None:
-        """Starts it; its words go to a log in `folder`."""
+    def __init__(
+        self, *, kind: str, command: Sequence[str], folder: Path, quiet: bool
+    ) -> None:
+        """Starts it; its words go to a log in `folder`. `quiet`: one thread each."""
         self.kind = kind
         self._log = folder / f"{kind}.log"
         environment = {
             **os.environ,
             "PYTHONPATH": _root(),
+            "JAX_PLATFORMS": "cpu",
             "TF_CPP_MIN_LOG_LEVEL": "3",
         }
         with self._log.open("w") as log:
@@ -93,7 +102,7 @@ class Child:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                env=environment,
+                env={**environment, **(ONE_THREAD if quiet else {})},
                 start_new_session=True,  # Ctrl-C is the bench's to handle
             )
         self._account = psutil.Process(self._process.pid)
@@ -192,10 +201,9 @@ class Crewed:
             self._add("service", folder, shard=shard, ports=[port])
         for child in self._children:
             child.wait_ready()
-        others = [
-            self._add("writers", folder, ports=ports),
-            self._add("reader", folder, ports=ports),
-        ]
+        others = [self._add("writers", folder, ports=ports)]
+        if crew.reader:
+            others.append(self._add("reader", folder, ports=ports))
         for child in others:
             child.wait_ready()
 
@@ -208,6 +216,8 @@ class Crewed:
             "peer": contestant.name,
             "shared_memory": contestant.shared_memory,
             "writers": crew.writers,
+            "render": crew.render if kind == "reader" else "",
+            "cores": self._cores(kind),
             "folder": str(folder / label),
             **more,
         }
@@ -219,9 +229,17 @@ class Crewed:
             kind=label,
             command=command,
             folder=folder,
+            quiet=crew.one_core and kind == "reader",
         )
         self._children.append(child)
         return child
+
+    def _cores(self, kind: str) -> list[int]:
+        """The cores that a process may use; all where nobody is to be alone."""
+        cores = sorted(os.sched_getaffinity(0))
+        if not self._crew.one_core or len(cores) == 1:
+            return cores
+        return cores[-1:] if kind == "reader" else cores[:-1]
 
     def _end(self) -> None:
         for child in self._children:
@@ -264,6 +282,7 @@ def measure(
         "shared_memory": contestant.shared_memory,
         "shards": crew.shards,
         "writers": crew.writers,
+        "batches_per_reply": workload.batches_per_reply,
         "load_average": os.getloadavg()[0],
         **figures(first, last),
     }

@@ -1,14 +1,22 @@
 """The sections of `slipstream bench replay`; see `launch.bench_replay`."""
 
+import dataclasses
 import statistics
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
-from launch.bench_replay_runs import Contestant, Workload, measure
+from launch import bench_child
+from launch.bench_replay_runs import Contestant, Crew, Workload, measure
+from launch.config import PRESETS
 from launch.converting import say
+from launch.scenes import write_procedural
 
 Row = dict[str, Any]
+PRESET: Final = "paper"  # whose rows and observations are measured
+WINDOW: Final = 200  # rows that the limiter's sides may be apart, at least
 OURS: Final = (
     Contestant(name="slipstream"),
     Contestant(name="slipstream", shared_memory=True),
@@ -24,64 +32,123 @@ class Sizes:
     """How much is measured."""
 
     repetitions: int = 3
-    seconds: float = 5.0
+    seconds: float = 3.0
     capacity: int = 20_000
-    min_size: int = 2_000
+    min_size: int = 16_000  # most of a ring is filled before the limiter counts
+    batches_per_reply: int = 4
+    scenes: int = 16  # of the bank that rows are rendered from
 
-    def workload(self) -> Workload:
-        """Rows of 8 KB."""
-        return Workload(
-            capacity=self.capacity,
-            min_size=self.min_size,
-            # A small table needs a wider window for batches of 64 (`replay.limiter`).
-            tolerance=max(0.1, 64 / self.min_size),
-        )
+    def workload(self, **changes: Any) -> Workload:  # noqa: ANN401 - any of its fields
+        """Rows of 8 KB unless `changes` says something else."""
+        known = {
+            "capacity": self.capacity,
+            "min_size": self.min_size,
+            "batches_per_reply": self.batches_per_reply,
+        }
+        load = Workload(**{**known, **changes})
+        # As narrow as the batches allow (`replay.limiter`), whatever the size.
+        sampled = load.batch_size * load.batches_per_reply / load.samples_per_insert
+        rows = max(WINDOW, load.insert_rows + sampled)
+        return dataclasses.replace(load, tolerance=rows / load.min_size)
 
 
 def throughput(sizes: Sizes, peer: Contestant | None) -> Iterator[Row]:
     """Rows of 8 KB: one writer, one reader, priorities set for every batch."""
-    contestants = (*OURS, *TORCHRL, *([peer] if peer else []))
+    several = sizes.batches_per_reply
+    turns = [(contestant, several) for contestant in (*OURS, *TORCHRL)]
+    if several > 1:
+        turns += [(contestant, 1) for contestant in OURS]
+    if peer is not None:
+        turns.append((peer, 1))
     for repetition in range(sizes.repetitions):
-        for contestant in contestants:
-            say(f"throughput: {contestant.label}, repetition {repetition + 1}")
-            found = measure(contestant, sizes.workload(), seconds=sizes.seconds)
+        for contestant, batches in turns:
+            say(
+                f"throughput: {contestant.label}, batches in a reply: {batches}, "
+                f"repetition {repetition + 1}"
+            )
+            load = sizes.workload(batches_per_reply=batches)
+            found = measure(contestant, load, seconds=sizes.seconds)
             yield {"repetition": repetition, **found}
 
 
-def ratios(rows: Sequence[Mapping[str, Any]], ours: bool, peer: str) -> list[float]:
+def rows(sizes: Sizes, peer: Contestant | None) -> Iterator[Row]:
+    """The project's rows: sampled beside a peer's items of 8 KB, and rendered."""
+    history = PRESETS[PRESET]().environment.observation.history
+    with tempfile.TemporaryDirectory(prefix="slipstream-bench-") as folder:
+        bank = Path(folder) / "rows.bank"
+        write_procedural(bank, count=sizes.scenes, seed=1)
+        load = sizes.workload(history=history, bank=str(bank))
+        for repetition in range(sizes.repetitions):
+            for contestant in OURS:
+                say(f"rows: {contestant.label}, repetition {repetition + 1}")
+                found = measure(contestant, load, seconds=sizes.seconds)
+                yield {"what": "sampled", "repetition": repetition, **found}
+            if peer is not None:
+                say(f"rows: {peer.label}, 8 KB, repetition {repetition + 1}")
+                eight = sizes.workload(batches_per_reply=1)
+                found = measure(peer, eight, seconds=sizes.seconds)
+                yield {"what": "sampled", "repetition": repetition, **found}
+            say(f"rows: rendering, repetition {repetition + 1}")
+            crew = Crew(render=PRESET, one_core=True)
+            found = measure(OURS[1], load, crew, seconds=sizes.seconds)
+            yield {
+                "what": "sampled and rendered",
+                "repetition": repetition,
+                "observations_per_s": 2 * found["samples_per_s"],
+                **found,
+            }
+            request = {
+                "bank": str(bank),
+                "preset": PRESET,
+                "rows": load.batch_size,
+                "seconds": sizes.seconds,
+            }
+            for alone in bench_child.run("rendering", request, one_core=True):
+                yield {"what": "rendered", "repetition": repetition, **alone}
+
+
+def ratios(
+    rows: Sequence[Mapping[str, Any]], ours: bool, peer: str, theirs: bool = False
+) -> list[float]:
     """Our samples/s over a peer's, repetition by repetition.
 
-    `ours`: by shared memory. A peer is compared over TCP: what a user would have.
+    `ours`, `theirs`: by shared memory. Of ours the turn with the most batches in a
+    reply counts, which is the designed path.
     """
     found = []
     for repetition in sorted({row["repetition"] for row in rows}):
         same = [row for row in rows if row["repetition"] == repetition]
         mine = _rate(same, "slipstream", ours)
-        theirs = _rate(same, peer, False)
-        if mine and theirs:
-            found.append(mine / theirs)
+        other = _rate(same, peer, theirs)
+        if mine and other:
+            found.append(mine / other)
     return found
 
 
 def _rate(
     rows: Sequence[Mapping[str, Any]], name: str, shared_memory: bool
 ) -> float | None:
-    for row in rows:
-        if (row["contestant"], row["shared_memory"]) == (name, shared_memory):
-            return float(row["samples_per_s"])
-    return None
+    same = [
+        row
+        for row in rows
+        if (row["contestant"], row["shared_memory"]) == (name, shared_memory)
+    ]
+    if not same:
+        return None
+    return float(max(same, key=lambda row: row["batches_per_reply"])["samples_per_s"])
 
 
 def medians(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
     """Each contestant's medians over its repetitions, in the order of the run."""
-    groups: dict[tuple[str, bool], list[Mapping[str, Any]]] = {}
+    groups: dict[tuple[str, bool, int], list[Mapping[str, Any]]] = {}
     for row in rows:
-        key = (row["contestant"], row["shared_memory"])
+        key = (row["contestant"], row["shared_memory"], row["batches_per_reply"])
         groups.setdefault(key, []).append(row)
     return [
         {
             "contestant": name,
             "shared_memory": shared,
+            "batches_per_reply": batches,
             "repetitions": len(group),
             **{
                 what: statistics.median(row[what] for row in group)
@@ -99,5 +166,5 @@ def medians(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
                 for kind in group[0]["cpu_us_per_sample_by"]
             },
         }
-        for (name, shared), group in groups.items()
+        for (name, shared, batches), group in groups.items()
     ]

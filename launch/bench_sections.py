@@ -83,6 +83,13 @@ def _bicycle(request: Request, folder: Path) -> Iterator[Any]:
     return bench_bicycle.bicycle(source_from(request).scenes())
 
 
+def _rendering(request: Request, folder: Path) -> Iterator[Any]:
+    # Of `bench replay`; imported here, for nothing else of it is needed.
+    from launch.bench_replay_rows import rendering
+
+    return rendering(request)
+
+
 SECTIONS: Final[dict[str, Callable[[Request, Path], Iterator[Any]]]] = {
     "yardsticks": _yardsticks,
     "table6": _table6,
@@ -92,6 +99,7 @@ SECTIONS: Final[dict[str, Callable[[Request, Path], Iterator[Any]]]] = {
     "banks": _banks,
     "bank": _bank,
     "bicycle": _bicycle,
+    "rendering": _rendering,
 }
 # Small programs only wait for one another on a second core.
 ONE_CORE: Final = frozenset({"yardsticks", "table6", "oracle", "steps", "scale"})

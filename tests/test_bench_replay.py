@@ -3,9 +3,14 @@
 import json
 import os
 import re
+import signal
 import stat
+import subprocess
+import sys
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from launch.bench_replay_figures import figures
@@ -15,10 +20,13 @@ from launch.bench_replay_sections import medians, ratios
 from launch.main import main
 
 
-def row(name: str, rate: float, repetition: int, *, shared: bool = False) -> dict:
+def row(
+    name: str, rate: float, repetition: int, *, shared: bool = False, batches: int = 4
+) -> dict:
     return {
         "contestant": name,
         "shared_memory": shared,
+        "batches_per_reply": batches,
         "repetition": repetition,
         "samples_per_s": rate,
         "inserts_per_s": rate / 8,
@@ -29,6 +37,7 @@ def row(name: str, rate: float, repetition: int, *, shared: bool = False) -> dic
 
 
 ROWS = [
+    row("slipstream", 40.0, 0, batches=1),
     row("slipstream", 60.0, 0),
     row("slipstream", 90.0, 0, shared=True),
     row("reverb", 10.0, 0),
@@ -42,12 +51,15 @@ def test_ratios_are_within_a_repetition() -> None:
     assert ratios(ROWS, False, "reverb") == [6.0, 2.5]
     assert ratios(ROWS, True, "reverb") == [9.0, 4.0]
     assert ratios(ROWS, True, "torchrl") == []
+    both = [*ROWS, row("torchrl", 30.0, 0, shared=True)]
+    assert ratios(both, True, "torchrl") == []
+    assert ratios(both, True, "torchrl", True) == [3.0]
 
 
 def test_medians_are_per_contestant_and_link() -> None:
     found = medians(ROWS)
-    assert [r["samples_per_s"] for r in found] == [55.0, 85.0, 15.0]
-    assert [r["repetitions"] for r in found] == [2, 2, 2]
+    assert [r["samples_per_s"] for r in found] == [40.0, 55.0, 85.0, 15.0]
+    assert [r["repetitions"] for r in found] == [1, 2, 2, 2]
 
 
 def test_figures_are_what_happened_between_two_looks() -> None:
@@ -85,7 +97,7 @@ def test_figures_are_what_happened_between_two_looks() -> None:
 def test_the_bars_are_drawn() -> None:
     drawn = figures({"sections": {"throughput": ROWS}})
     assert drawn["replay_throughput.png"].startswith(b"\x89PNG")
-    assert [table.row_count for table in tables(ROWS)] == [3, 2]
+    assert [table.row_count for table in tables("throughput", ROWS)] == [4, 2]
 
 
 @pytest.mark.parametrize(
@@ -95,6 +107,7 @@ def test_the_bars_are_drawn() -> None:
         (["--against", "reverb=/nowhere/python"], "is no program"),
         (["--sections", "speed"], "speed"),
         (["--repetitions", "0"], "at least 1"),
+        (["--batches-per-reply", "0"], "at least 1"),
         (["--json", f"{__file__}/f.json"], "is not a folder"),
     ],
 )
@@ -118,20 +131,69 @@ def test_a_python_without_reverb_is_refused(
     assert "No module named 'reverb'" in said and "\n" not in said
 
 
+def measured(sections: str, tmp_path: Path) -> list[dict]:
+    """What a brief run of one section found."""
+    file = tmp_path / "f.json"
+    words = ["--quick", "--sections", sections, "--json", str(file)]
+    assert main(["bench", "replay", *words]) == 0
+    assert os.listdir(tmp_path) == ["f.json"]
+    found: list[dict] = json.loads(file.read_text())["sections"][sections]
+    return found
+
+
 @pytest.mark.slow
 def test_ours_and_torchrl_with_real_processes(tmp_path: Path) -> None:
-    file = tmp_path / "f.json"
-    words = ["--quick", "--sections", "throughput", "--json", str(file)]
-    assert main(["bench", "replay", *words]) == 0
-    found = json.loads(file.read_text())["sections"]["throughput"]
-    assert [(r["contestant"], r["shared_memory"]) for r in found] == [
-        ("slipstream", False),
-        ("slipstream", True),
-        ("torchrl", False),
-        ("torchrl", True),
+    found = measured("throughput", tmp_path)
+    turns = [
+        (r["contestant"], r["shared_memory"], r["batches_per_reply"]) for r in found
     ]
-    for measured in found:
-        assert measured["samples_per_s"] > 0
-        assert 4.0 < measured["samples_per_insert"] < 16.0  # of a short window
-        assert min(measured["cores"].values()) >= 0.0
-    assert not [f for f in os.listdir(tmp_path) if f != "f.json"]
+    assert turns == [
+        ("slipstream", False, 4),
+        ("slipstream", True, 4),
+        ("torchrl", False, 4),
+        ("torchrl", True, 4),
+        ("slipstream", False, 1),
+        ("slipstream", True, 1),
+    ]
+    for turn in found:
+        assert turn["samples_per_s"] > 0
+        assert 4.0 < turn["samples_per_insert"] < 16.0  # of a short window
+        assert min(turn["cores"].values()) >= 0.0
+
+
+@pytest.mark.slow
+def test_state_rows_are_sampled_and_rendered(tmp_path: Path) -> None:
+    found = measured("rows", tmp_path)
+    assert [r["what"] for r in found] == [
+        "sampled",
+        "sampled",
+        "sampled and rendered",
+        "rendered",
+    ]
+    assert found[2]["observations_per_s"] == 2 * found[2]["samples_per_s"] > 0
+    assert found[3]["observations_per_s"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_bench_leaves_nothing(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    words = ["--sections", "throughput", "--json", str(tmp_path / "f.json")]
+    bench = subprocess.Popen(
+        [sys.executable, "-m", "launch", "bench", "replay", *words],
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while len(children := psutil.Process(bench.pid).children()) < 3:
+            assert bench.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        assert list(tmp_path.glob("slipstream-bench-*"))
+        bench.send_signal(number)
+        assert bench.wait(30) == 130
+    finally:
+        bench.kill()
+    assert not [child for child in children if child.is_running()]
+    assert not os.listdir(tmp_path)
