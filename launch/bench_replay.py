@@ -5,6 +5,8 @@ Sections, each of which can be had alone:
     throughput   samples/s and CPU time per sample of 8 KB rows, over TCP and by shared
                  memory, ours, torchrl's buffer behind our wire, and Reverb's
     rows         the project's own rows of 128 bytes, and rendering their observations
+    memory       what a row takes in the service's memory, and on the wire
+    scale        shards, writers, and the model of a larger run (`bench_replay_model`)
 
 Contestants take turns, repetition by repetition, so that what else the machine does
 hits all alike; ratios are within a repetition, then their median and least are told.
@@ -27,7 +29,9 @@ from typing import Any, Final, Literal, get_args
 
 from launch import bench_replay_print, bench_replay_sections
 from launch.bench import machine
+from launch.bench_replay_memory import memory
 from launch.bench_replay_runs import Contestant
+from launch.bench_replay_scale import scale
 from launch.bench_replay_sections import Sizes
 from launch.bench_sim import check_outputs
 from launch.bench_timing import processor_name
@@ -38,13 +42,15 @@ from launch.tables import printer
 FORMAT: Final = 1
 PEER: Final = "reverb"
 PROBE_S: Final = 120.0  # for another Python to import TensorFlow
-Section = Literal["throughput", "rows"]
+Section = Literal["throughput", "rows", "memory", "scale"]
 ALL: Final[tuple[Section, ...]] = get_args(Section)
 SECTIONS: Final[
     dict[str, Callable[[Sizes, Contestant | None], Iterator[dict[str, Any]]]]
 ] = {
     "throughput": bench_replay_sections.throughput,
     "rows": bench_replay_sections.rows,
+    "memory": memory,
+    "scale": scale,
 }
 
 
@@ -93,6 +99,9 @@ class ReplayBenchConfig:
                 min_size=128,
                 batches_per_reply=self.batches_per_reply,
                 scenes=1,
+                memory_rows=((8192, 2048), (128, 4096)),
+                shards=(1, 2),
+                writers=(1, 4),
             )
         return Sizes(
             repetitions=self.repetitions,

@@ -20,6 +20,8 @@ def figures(report: Mapping[str, Any]) -> dict[str, bytes]:
     sections = report["sections"]
     if "throughput" in sections:
         drawn["replay_throughput"] = throughput_figure(sections["throughput"])
+    if "scale" in sections:
+        drawn["replay_scale"] = scale_figure(sections["scale"])
     return {
         f"{name}.{kind}": encoded(figure, kind)
         for name, figure in drawn.items()
@@ -73,4 +75,29 @@ def throughput_figure(rows: Sequence[Row]) -> Figure:
     figure.legend(loc="outside lower right", ncols=3, fontsize=8)
     for axes in (rates, costs):
         axes.grid(visible=True, axis="x", alpha=0.35)
+    return figure
+
+
+def scale_figure(rows: Sequence[Row]) -> Figure:
+    """Samples/s and CPU time per sample against writers, a line per shard count."""
+    figure = _blank("Shards and writers, rows of 128 bytes, by shared memory")
+    found = [row for row in rows if row["what"] == "scale"]
+    panels = figure.subplots(1, 2)
+    for axes, what, label in (
+        (panels[0], "samples_per_s", "samples/s"),
+        (panels[1], "cpu_us_per_sample", "CPU time per sample [us]"),
+    ):
+        for shards in sorted({row["shards"] for row in found}):
+            line = [row for row in found if row["shards"] == shards]
+            x = [row["writers"] for row in line]
+            y = [row[what] for row in line]
+            axes.plot(x, y, "o-", label=f"{shards} shard{'s' if shards > 1 else ''}")
+        axes.set_xscale("log", base=2)
+        axes.set_ylim(bottom=0)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axes.set_xlabel("writers")
+        axes.set_ylabel(label)
+        axes.grid(visible=True, alpha=0.35)
+    panels[0].legend(fontsize=8)
     return figure

@@ -26,6 +26,11 @@ def tables(section: str, rows: Sequence[Row]) -> Iterator[Table]:
     if section == "throughput":
         yield _rates("8 KB rows, 8 samples per insert, batches of 64", rows)
         yield _ratios(rows, WANTED)
+    elif section == "memory":
+        yield _memory(rows)
+    elif section == "scale":
+        yield _scale([row for row in rows if row["what"] == "scale"])
+        yield _model(next(row for row in rows if row["what"] == "model"))
     else:
         sampled = [row for row in rows if row["what"] == "sampled"]
         yield _rates("Rows of 128 bytes, a peer's of 8 KB", sampled)
@@ -116,3 +121,61 @@ def _rendering(rows: Sequence[Row]) -> Table:
 
 def _reader_us(row: Row) -> float:
     return float(row["cpu_us_per_sample_by"]["reader"]) / 2
+
+
+def _memory(rows: Sequence[Row]) -> Table:
+    table = _table(
+        "Memory of the service's process per row", "contestant", "row", "grown", "times"
+    )
+    for row in rows:
+        if row["what"] == "process":
+            table.add_row(
+                f"{row['contestant']}{', durable' if row['durable'] else ''}",
+                f"{row['row_bytes']:,} B",
+                f"{row['bytes_per_row']:,.0f} B",
+                f"{row['over_own_bytes']:.3f}",
+            )
+        else:
+            table.caption = (
+                f"A transition in messages of 64: insert {row['insert']:.0f} B, "
+                f"sample {row['sample_reply']:.0f} B, its request "
+                f"{row['sample_request']:.0f} B"
+            )
+    return table
+
+
+def _scale(rows: Sequence[Row]) -> Table:
+    table = _table(
+        "Shards and writers, rows of 128 bytes",
+        "shards",
+        "writers",
+        "samples/s",
+        "inserts/s",
+        "CPU us/sample",
+    )
+    for row in rows:
+        table.add_row(
+            str(row["shards"]),
+            str(row["writers"]),
+            f"{row['samples_per_s']:,.0f}",
+            f"{row['inserts_per_s']:,.0f}",
+            f"{row['cpu_us_per_sample']:.1f}",
+        )
+    return table
+
+
+def _model(row: Row) -> Table:
+    run, error = row["run"], row["relative_error_checked"]
+    table = _table(
+        f"{run['actors']:,} actors, {run['samples_per_s']:,.0f} samples/s: needed",
+        "what",
+        "how much",
+        caption=f"The model is off by {error['all']:.0%} (median) and at most "
+        f"{error['all_largest']:.0%} at points that it was not fitted to",
+    )
+    for kind, cores in row["cores"].items():
+        table.add_row(f"cores, {kind}", f"{cores:.2f}")
+    table.add_row("shards", str(row["shards"]))
+    for link, rate in row["bytes_per_s"].items():
+        table.add_row(link.replace("_", " "), f"{rate / 1e6:,.1f} MB/s")
+    return table

@@ -1,8 +1,8 @@
 """The peer Reverb in `slipstream bench replay`: its service, a writer, a reader.
 
 Run by another Python, which has dm-reverb; of Slipstream it imports nothing but
-`bench_replay_lines`, of the standard library. It does, for Reverb's sake, what its
-documentation recommends for throughput:
+`bench_replay_lines`, of the standard library. One reasonable setting, not a search for
+Reverb's best:
 
     writing   TrajectoryWriter, chunks of one item, at most three batches unconfirmed
     reading   TrajectoryDataset, batched and prefetched by tf.data, as NumPy arrays
@@ -85,7 +85,7 @@ def reader(wanted: dict[str, Any]) -> None:
         dtypes={"x": tensorflow.uint8},
         shapes={"x": tensorflow.TensorShape([load["row_bytes"]])},
         max_in_flight_samples_per_worker=2 * batch,
-        num_workers_per_iterator=wanted.get("workers", 1),
+        num_workers_per_iterator=1,
     )
     samples = dataset.batch(batch, drop_remainder=True).prefetch(2)
     random = np.random.default_rng(0)

@@ -37,6 +37,9 @@ class Sizes:
     min_size: int = 16_000  # most of a ring is filled before the limiter counts
     batches_per_reply: int = 4
     scenes: int = 16  # of the bank that rows are rendered from
+    memory_rows: tuple[tuple[int, int], ...] = ((8192, 1 << 14), (128, 1 << 19))
+    shards: tuple[int, ...] = (1, 2, 3, 4)
+    writers: tuple[int, ...] = (1, 4, 16, 64)
 
     def workload(self, **changes: Any) -> Workload:  # noqa: ANN401 - any of its fields
         """Rows of 8 KB unless `changes` says something else."""

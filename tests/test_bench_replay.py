@@ -14,6 +14,7 @@ import psutil
 import pytest
 
 from launch.bench_replay_figures import figures
+from launch.bench_replay_memory import message_bytes
 from launch.bench_replay_print import tables
 from launch.bench_replay_runs import figures as between
 from launch.bench_replay_sections import medians, ratios
@@ -94,6 +95,12 @@ def test_figures_are_what_happened_between_two_looks() -> None:
     assert found["cpu_us_per_sample"] == pytest.approx(1e6 / 800)
 
 
+def test_a_transition_is_small_in_every_message() -> None:
+    told = message_bytes()
+    assert told["row_bytes"] == 128
+    assert max(told["insert"], told["sample_reply"]) <= 600
+
+
 def test_the_bars_are_drawn() -> None:
     drawn = figures({"sections": {"throughput": ROWS}})
     assert drawn["replay_throughput.png"].startswith(b"\x89PNG")
@@ -172,6 +179,28 @@ def test_state_rows_are_sampled_and_rendered(tmp_path: Path) -> None:
     ]
     assert found[2]["observations_per_s"] == 2 * found[2]["samples_per_s"] > 0
     assert found[3]["observations_per_s"] > 0
+
+
+@pytest.mark.slow
+def test_memory_is_what_the_process_grew_by(tmp_path: Path) -> None:
+    *processes, messages = measured("memory", tmp_path)
+    eight = [r for r in processes if r["row_bytes"] == 8192]
+    assert [(r["contestant"], r["durable"]) for r in eight] == [
+        ("slipstream", False),
+        ("slipstream", True),
+        ("torchrl", False),
+    ]
+    assert 0.8 < eight[0]["over_own_bytes"] < 3.0  # of few rows
+    assert messages["row_bytes"] == 128
+
+
+@pytest.mark.slow
+def test_scale_ends_in_a_model(tmp_path: Path) -> None:
+    found = measured("scale", tmp_path)
+    crews = [(r["shards"], r["writers"]) for r in found if r["what"] == "scale"]
+    assert crews == [(1, 1), (1, 4), (2, 2), (2, 4)]
+    assert found[-1]["what"] == "model" and found[-1]["shards"] >= 1
+    assert found[-1]["cores"]["service"] > 0.0
 
 
 @pytest.mark.slow
