@@ -24,11 +24,10 @@ KILOBYTES: Final = 8192  # of the rows that peers are compared on
 
 def memory(sizes: Sizes, peer: Contestant | None) -> Iterator[Row]:
     """Growth of the service's process per row, and bytes per row in messages."""
-    peers = [TORCHRL[0], *([peer] if peer else [])]
     for row_bytes, count in sizes.memory_rows:
         turns = [(OURS[0], False), (OURS[0], True)]
         if row_bytes == KILOBYTES:
-            turns += [(other, False) for other in peers]
+            turns.append((TORCHRL[0], False))
         for contestant, durable in turns:
             say(f"memory: {contestant.label}, {count:,} rows of {row_bytes} B")
             held = [
