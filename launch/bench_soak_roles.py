@@ -1,0 +1,147 @@
+"""The soak's processes: a durable service, writers and a reader, each to be killed.
+
+    python -m launch.bench_soak_roles service ENDPOINT FOLDER
+    python -m launch.bench_soak_roles writer ENDPOINT WRITER LIFE
+    python -m launch.bench_soak_roles reader ENDPOINT
+
+They run at full rate until SIGTERM. Writers print how many rows are acknowledged, the
+reader how many it received and how many of those were damaged, as they go.
+"""
+
+import contextlib
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Integer
+
+from replay.client import ReplayTimeout, Sampler, Writer
+from replay.keys import RunKeys
+from replay.server import ReplayConfig, ReplayServer
+from replay.session import open_session
+from replay.spec import Field, RowSpec
+
+KEYS: Final = RunKeys("soak")
+SPEC: Final = RowSpec(
+    (
+        Field("writer", "i4"),
+        Field("life", "i4"),
+        Field("number", "i8"),
+        Field("words", "u8", (14,)),  # to 128 bytes
+    )
+)
+# The ring comes round within seconds, so that what grows afterwards is a leak.
+CONFIG: Final = ReplayConfig(
+    capacity=1 << 19,
+    min_size=1_000,
+    samples_per_insert=1.0,
+    tolerance=1.0,
+    sampler="uniform",  # starts without torch: more kills find it at work
+    durable=True,
+    sync_s=1.0,
+)
+BATCH: Final = 64
+_TOLD_S = 0.2
+
+
+def words_of(
+    writer: Integer[np.ndarray, " rows"],
+    life: Integer[np.ndarray, " rows"],
+    number: Integer[np.ndarray, " rows"],
+) -> Integer[np.ndarray, "rows words"]:
+    """What a row holds: it follows from who wrote it and its number."""
+    seed = number.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    seed += writer.astype(np.uint64) << np.uint64(32)
+    seed += life.astype(np.uint64)
+    return seed[:, None] * (
+        np.arange(14, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+    )
+
+
+def rows_of(writer: int, life: int, start: int) -> np.ndarray:
+    """A batch of rows from number `start` on."""
+    rows = np.zeros(BATCH, SPEC.dtype)
+    rows["writer"], rows["life"] = writer, life
+    rows["number"] = np.arange(start, start + BATCH)
+    rows["words"] = words_of(rows["writer"], rows["life"], rows["number"])
+    return rows
+
+
+def are_whole(rows: np.ndarray) -> Bool[np.ndarray, " rows"]:
+    """Which rows are as they were written."""
+    words = words_of(rows["writer"], rows["life"], rows["number"])
+    return (rows["words"] == words).all(axis=1)
+
+
+def _until_term() -> threading.Event:
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    return stop
+
+
+def _serve(endpoint: str, folder: Path) -> None:
+    stop = _until_term()
+    session: Any = open_session(listen=[endpoint], router=True)
+    server = ReplayServer(
+        session=session,
+        keys=KEYS,
+        spec=SPEC,
+        config=CONFIG,
+        folder=folder,
+        largest=(BATCH, BATCH),
+    )
+    server.run(stop)
+    session.close()
+
+
+def _write(endpoint: str, writer: int, life: int) -> None:
+    stop, start, due = _until_term(), 0, 0.0
+    session: Any = open_session(connect=[endpoint], timeout_s=60.0)
+    sink = Writer(
+        session=session, keys=KEYS, spec=SPEC, writer=writer, epoch=life, hold_s=1.0
+    )
+    while not stop.is_set():
+        rows = rows_of(writer, life, start)
+        # What did not fit in time is whole and offered again.
+        while not sink.append(rows, _TOLD_S) and not stop.is_set():
+            rows = rows[:0]
+        start += BATCH
+        if time.monotonic() > due:
+            due = time.monotonic() + _TOLD_S
+            print(sink.acknowledged, flush=True)
+    sink.close(30.0)
+    print(sink.acknowledged, flush=True)
+    session.close()
+
+
+def _read(endpoint: str) -> None:
+    stop, received, damaged, due = _until_term(), 0, 0, 0.0
+    session: Any = open_session(connect=[endpoint], timeout_s=60.0)
+    sampler = Sampler(
+        session=session, keys=KEYS, spec=SPEC, batch_size=BATCH, hold_s=1.0
+    )
+    random = np.random.default_rng(0)
+    while not stop.is_set():
+        with contextlib.suppress(ReplayTimeout):
+            sample = sampler.sample(_TOLD_S)
+            received += BATCH
+            damaged += int((~are_whole(sample.rows)).sum())
+            sampler.update_priorities(sample.ids, random.gamma(1.0, size=BATCH))
+        if time.monotonic() > due:
+            due = time.monotonic() + _TOLD_S
+            print(received, damaged, flush=True)
+    print(received, damaged, flush=True)
+    session.close()
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "service":
+        _serve(sys.argv[2], Path(sys.argv[3]))
+    elif sys.argv[1] == "writer":
+        _write(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+    else:
+        _read(sys.argv[2])
