@@ -15,14 +15,14 @@ What must hold, and is said line by line at the end:
     memory    of each life longer than a third of the half: the line of least squares
               after its warm-up grows by at most 6% and 4 MiB
     handles   open files and threads of such a life: at most 4 more at its end
-    storage   the replay's folder and shared memory grow no more once the ring is full
+    storage   the replay's folder and the shared memory that the soak's own processes
+              have mapped grow no more once the ring is full
 """
 
 import argparse
 import contextlib
 import json
 import random
-import shutil
 import socket
 import subprocess
 import sys
@@ -45,7 +45,7 @@ from replay.spec import ReplayError
 _LOOK_S: Final = 2.0
 _KILL_S: Final = 6.0  # on average, between kills
 _MARGIN: Final = 4 << 20  # bytes a life may grow beside 6%
-_SHARED: Final = Path("/dev/shm")
+_SHARED: Final = "/dev/shm/"
 
 
 @final
@@ -86,6 +86,11 @@ class Child:
                 "files": self._watched.num_fds(),
                 "threads": self._watched.num_threads(),
             }
+
+    def segments(self) -> set[str]:
+        """Named shared memory that it has mapped, also what others made."""
+        maps = Path(f"/proc/{self._process.pid}/maps").read_text().split()
+        return {word for word in maps if word.startswith(_SHARED)}
 
     def end(self, *, kill: bool) -> None:
         """kill -9, or SIGTERM and a minute."""
@@ -219,13 +224,21 @@ class Soak:
                 for name, child in self._children.items()
             },
             "disk_bytes": 512 * sum(stat.st_blocks for stat in files),
-            "shared_bytes": shutil.disk_usage(_SHARED).used if _SHARED.exists() else 0,
+            "shared_bytes": self._shared_bytes(),
         }
         with contextlib.suppress(ReplayError):
             stats = fetch_stats(self._session, KEYS, timeout=2.0)
             for name in ("inserts", "samples", "debt", "tolerance", "insert_rate"):
                 look[name] = stats[name]
         return look
+
+    def _shared_bytes(self) -> int:
+        segments = [child.segments() for child in self._children.values()]
+        taken = 0
+        for name in set().union(*segments):
+            with contextlib.suppress(FileNotFoundError):  # unmapped meanwhile
+                taken += 512 * Path(name).stat().st_blocks
+        return taken
 
     def close(self) -> dict[str, Any]:
         """Ends the clients, looks at the last rows, ends the service."""
@@ -328,6 +341,9 @@ def verdict(
         "unseen_rows": soak.rows.unseen,
         "kills": soak.kills,
         "growth_bytes": growths,
+        "shared_bytes": [
+            look["shared_bytes"] for look in looks[:: max(1, len(looks) // 20)]
+        ],
     }
 
 

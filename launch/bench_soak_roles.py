@@ -36,11 +36,11 @@ SPEC: Final = RowSpec(
 )
 # The ring comes round within seconds, so that what grows afterwards is a leak.
 CONFIG: Final = ReplayConfig(
-    capacity=1 << 19,
+    capacity=1 << 17,
     min_size=1_000,
     samples_per_insert=1.0,
     tolerance=1.0,
-    sampler="uniform",  # starts without torch: more kills find it at work
+    sampler="prioritized",
     durable=True,
     sync_s=1.0,
 )
