@@ -57,7 +57,7 @@ def write(endpoint: str, writers: range, stop: threading.Event) -> None:
                 writer=writer,
                 epoch=1,
                 batch_rows=BATCH,
-                hold_s=0.2,
+                window=2,
             )
             for writer in writers
         ]
@@ -103,10 +103,7 @@ def marks_of(config: ReplayConfig, writers: int, inserts: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "writers",
-    [1, 8],
-)
+@pytest.mark.parametrize("writers", [1, 8, 64])
 def test_ratio_is_within_a_hundredth_over_any_ten_thousand_inserts(
     writers: int,
 ) -> None:
