@@ -214,7 +214,7 @@ def test_weighted_draws_are_one_big_tables() -> None:
         def settled() -> bool:
             batch = sampler.sample(20.0)
             exact = [expected[i] for i in batch.ids.tolist()]
-            return np.allclose(batch.probabilities, exact, 1e-9, 0)
+            return np.allclose(batch.probabilities, exact, 1e-6, 0)  # float32 masses
 
         assert eventually(settled)
         for _ in range(30):  # what was under way when the priorities changed
@@ -224,7 +224,7 @@ def test_weighted_draws_are_one_big_tables() -> None:
             batch
             for batch in drawn
             if np.allclose(
-                batch.probabilities, [expected[i] for i in batch.ids.tolist()], 1e-9, 0
+                batch.probabilities, [expected[i] for i in batch.ids.tolist()], 1e-6, 0
             )
         ]
         assert len(exact) > 1200  # in the others a shard was late
