@@ -196,7 +196,7 @@ def test_every_process_may_be_killed(tmp_path: Path) -> None:
         *("--network.width", "16", "--network.latents", "2"),
         *("--report.checkpoint-s", "0.5", "--evaluator.seconds", "0"),
         *("--cloning.torch-threads", "1", "--cloning.batch-size", "16"),
-        *("--budget.minutes", "0", "--budget.updates", "800"),
+        *("--budget.minutes", "0", "--budget.updates", "2000"),
     )
     process = psutil.Popen(
         [sys.executable, "-m", "launch", "train", "bc", "--run", folder, *words],
@@ -215,12 +215,11 @@ def test_every_process_may_be_killed(tmp_path: Path) -> None:
     wait = functools.partial(wait_for, process)
     try:
         wait(lambda: updates() > 0, "a checkpoint")
-        wait(judged, "an evaluation")
+        # Before anything was judged: a slow evaluator may be left behind by the run.
         for name in ("replay", "filler", "evaluator", "learner"):
             wait(functools.partial(role, process, name), name).kill()
-        seen, before = updates(), len(judged())
+        seen = updates()
         wait(lambda: updates() > seen, "the learner's return")
-        wait(lambda: len(judged()) > before, "the evaluator's return")
         assert process.wait(PATIENCE_S) == 0
     finally:
         with contextlib.suppress(psutil.Error):
@@ -230,7 +229,7 @@ def test_every_process_may_be_killed(tmp_path: Path) -> None:
     assert set(status["restarts"].values()) == {1}
     assert status["replay"]["size"] == read_run(folder).config.replay.capacity
     steps = judged()
-    assert steps == sorted(set(steps)) and steps[-1] == updates() == 800
+    assert steps == sorted(set(steps)) and steps[-1] == updates() == 2000
     assert json.loads((folder / "evaluation.json").read_text())["agents"]
     best = json.loads((find_policy(folder).parent / "judged.json").read_text())
     known = read_curves(folder / "evaluation.csv")
