@@ -9,7 +9,6 @@ samples, an actor for its window of unacknowledged batches.
 
 import asyncio
 import dataclasses
-import json
 import os
 import platform
 import tempfile
@@ -21,7 +20,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from launch.config import BudgetConfig, quick, write_atomically
+from launch.bench_output import check_outputs, write_report
+from launch.config import BudgetConfig, quick
 from launch.errors import LaunchError
 from launch.supervisor import Outcome
 from launch.train import TrainConfig, prepare, supervise
@@ -89,6 +89,7 @@ def measured(first: Figures, last: Figures) -> dict[str, Any]:
 
 def pipeline_command(options: PipelineConfig) -> int:
     """`slipstream bench pipeline`."""
+    check_outputs(options.json)
     looks: list[Figures] = []
 
     def on_look(figures: Figures) -> None:
@@ -113,13 +114,9 @@ def pipeline_command(options: PipelineConfig) -> int:
     if len(looks) < 2:
         raise LaunchError("nothing was measured: give it more --seconds")
     content = {"machine": machine(), **measured(looks[0], looks[-1])}
-    text = json.dumps(content, indent=1)
-    if options.json == "-":
-        print(text)
-        return 0
-    if options.json:
-        write_atomically(Path(options.json), (text + "\n").encode())
-    Console().print(_table(content))
+    write_report(content, json_path=options.json)
+    if options.json != "-":
+        Console().print(_table(content))
     return 0
 
 

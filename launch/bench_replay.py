@@ -10,32 +10,28 @@ Sections, each of which can be had alone:
 
 Contestants take turns, repetition by repetition, so that what else the machine does
 hits all alike; ratios are within a repetition, then their median and least are told.
-Processes are real ones (`launch.bench_replay_runs`). Files are written at the end, each
-whole or not at all.
+Processes are real ones (`launch.bench_replay_runs`).
 """
 
 import contextlib
 import dataclasses
 import datetime
-import json
 import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 from launch import bench_replay_print, bench_replay_sections
 from launch.bench import machine
+from launch.bench_output import check_outputs, write_report
 from launch.bench_replay_memory import memory
 from launch.bench_replay_runs import Contestant
 from launch.bench_replay_scale import scale
 from launch.bench_replay_sections import Sizes
-from launch.bench_sim import check_outputs
 from launch.bench_timing import processor_name
-from launch.config import write_atomically
 from launch.errors import LaunchError
 from launch.tables import printer
 
@@ -132,7 +128,7 @@ def replay_command(options: ReplayBenchConfig) -> int:
             if options.json != "-":
                 for table in bench_replay_print.tables(name, found):
                     console.print(table)
-    _write(options, report)
+    write_report(report, json_path=options.json, plot=options.plot, figures=_figures)
     return 0
 
 
@@ -179,18 +175,7 @@ def reverb_of(against: str) -> Contestant | None:
     return Contestant(name="reverb", python=python)
 
 
-def _write(options: ReplayBenchConfig, report: dict[str, Any]) -> None:
-    if options.plot:
-        from launch.bench_replay_figures import figures
+def _figures(report: Mapping[str, Any]) -> dict[str, bytes]:
+    from launch.bench_replay_figures import figures  # matplotlib, only where wanted
 
-        folder = Path(options.plot)
-        drawn = figures(report)
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in drawn.items():
-            write_atomically(folder / name, data)
-    text = json.dumps(report, indent=1)
-    if options.json == "-":
-        print(text)
-    elif options.json:
-        Path(options.json).parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(Path(options.json), (text + "\n").encode())
+    return figures(report)

@@ -7,25 +7,21 @@ environments and objects), `banks` (the cost of the number of scenes), `bicycle`
 one-step error on logs). Figures are ratios within one run where they
 are to hold on another machine; every run says what machine it was.
 
-Each section runs in a process of its own (`launch.bench_child`). Files are written at
-the end, each whole or not at all.
+Each section runs in a process of its own (`launch.bench_child`).
 """
 
 import dataclasses
 import datetime
-import importlib.util
-import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 from launch import bench_child, bench_print, bench_targets
+from launch.bench_output import check_outputs, write_report
 from launch.bench_scenes import description, source_of
 from launch.bench_sections import ONE_CORE, Sizes
 from launch.bench_steps import STEPS
-from launch.config import write_atomically
-from launch.errors import LaunchError
 from launch.tables import printer
 
 FORMAT: Final = 1
@@ -133,7 +129,7 @@ def sim_command(options: SimConfig) -> int:
     report["targets"] = bench_targets.targets(report["sections"])
     if report["targets"] and not quiet:
         console.print(bench_print.targets_table(report["targets"]))
-    _write(options, report)
+    write_report(report, json_path=options.json, plot=options.plot, figures=_figures)
     return 0
 
 
@@ -149,45 +145,7 @@ def _words(scene: dict[str, Any]) -> str:
     )
 
 
-def check_outputs(json_path: str, plot: str) -> None:
-    """Refuses what could not be written, before minutes of measuring."""
-    if json_path and json_path != "-":
-        path = Path(json_path)
-        if path.is_dir():
-            raise LaunchError(f"--json {path}: is a folder; name a file")
-        _check_writable(path.parent, f"--json {path}")
-    if plot:
-        _check_writable(Path(plot), f"--plot {plot}")
-        if importlib.util.find_spec("matplotlib") is None:
-            raise LaunchError(
-                "--plot needs matplotlib, which is not installed; "
-                "pip install 'slipstream[learner]'"
-            )
+def _figures(report: Mapping[str, Any]) -> dict[str, bytes]:
+    from launch.bench_figures import figures  # matplotlib, only where it is wanted
 
-
-def _check_writable(folder: Path, what: str) -> None:
-    """Whether a folder can be written to, or made."""
-    there = folder.absolute()
-    while not there.exists():
-        there = there.parent
-    if not there.is_dir():
-        raise LaunchError(f"{what}: {there} is not a folder; choose another path")
-    if not os.access(there, os.W_OK):
-        raise LaunchError(f"{what}: {there} cannot be written; choose another path")
-
-
-def _write(options: SimConfig, report: dict[str, Any]) -> None:
-    if options.plot:
-        from launch.bench_figures import figures
-
-        folder = Path(options.plot)
-        drawn = figures(report)
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, data in drawn.items():
-            write_atomically(folder / name, data)
-    text = json.dumps(report, indent=1)
-    if options.json == "-":
-        print(text)
-    elif options.json:
-        Path(options.json).parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(Path(options.json), (text + "\n").encode())
+    return figures(report)

@@ -116,6 +116,8 @@ def test_the_bars_are_drawn() -> None:
         (["--repetitions", "0"], "at least 1"),
         (["--batches-per-reply", "0"], "at least 1"),
         (["--json", f"{__file__}/f.json"], "is not a folder"),
+        (["--json", "/proc/f.json"], "/proc cannot be written"),
+        (["--plot", "/proc/plots"], "/proc cannot be written"),
     ],
 )
 def test_mistakes_are_one_line_before_anything_is_measured(
