@@ -7,6 +7,8 @@ Sections, each of which can be had alone:
     rows         the project's own rows of 128 bytes, and rendering their observations
     memory       what a row takes in the service's memory, and on the wire
     scale        shards, writers, and the model of a larger run (`bench_replay_model`)
+    soak         ten minutes at full rate with random kills (`bench_soak`); only where
+                 it is asked for
 
 Contestants take turns, repetition by repetition, so that what else the machine does
 hits all alike; ratios are within a repetition, then their median and least are told.
@@ -31,6 +33,7 @@ from launch.bench_replay_memory import memory
 from launch.bench_replay_runs import Contestant
 from launch.bench_replay_scale import scale
 from launch.bench_replay_sections import Sizes
+from launch.bench_soak import soak
 from launch.bench_timing import processor_name
 from launch.errors import LaunchError
 from launch.tables import printer
@@ -38,8 +41,9 @@ from launch.tables import printer
 FORMAT: Final = 1
 PEER: Final = "reverb"
 PROBE_S: Final = 120.0  # for another Python to import TensorFlow
-Section = Literal["throughput", "rows", "memory", "scale"]
+Section = Literal["throughput", "rows", "memory", "scale", "soak"]
 ALL: Final[tuple[Section, ...]] = get_args(Section)
+DEFAULT: Final = ALL[:-1]  # without the soak, which takes ten minutes
 SECTIONS: Final[
     dict[str, Callable[[Sizes, Contestant | None], Iterator[dict[str, Any]]]]
 ] = {
@@ -47,6 +51,7 @@ SECTIONS: Final[
     "rows": bench_replay_sections.rows,
     "memory": memory,
     "scale": scale,
+    "soak": soak,
 }
 
 
@@ -54,7 +59,7 @@ SECTIONS: Final[
 class ReplayBenchConfig:
     """Measures the replay service."""
 
-    sections: tuple[Section, ...] = ALL
+    sections: tuple[Section, ...] = DEFAULT
     """What is measured."""
     against: str = ""
     """A peer that is not installed beside this: reverb=PYTHON, an interpreter whose
@@ -65,6 +70,8 @@ class ReplayBenchConfig:
     """How long each turn is measured."""
     batches_per_reply: int = 4
     """Batches in one reply of our service; section throughput measures 1 as well."""
+    soak_seconds: float = 600.0
+    """How long the section soak lasts."""
     quick: bool = False
     """The smallest sizes, once, briefly: tries everything, measures nothing well."""
     json: str = ""
@@ -79,6 +86,8 @@ class ReplayBenchConfig:
                 f"--repetitions {self.repetitions} must be at least 1 and --seconds "
                 f"{self.seconds} above 0"
             )
+        if not 0 < self.soak_seconds < float("inf"):
+            raise ValueError(f"--soak-seconds {self.soak_seconds} must be above 0")
         if self.batches_per_reply < 1:
             raise ValueError(
                 f"--batches-per-reply {self.batches_per_reply} must be at least 1"
@@ -98,11 +107,13 @@ class ReplayBenchConfig:
                 memory_rows=((8192, 2048), (128, 4096)),
                 shards=(1, 2),
                 writers=(1, 4),
+                soak_seconds=self.soak_seconds,
             )
         return Sizes(
             repetitions=self.repetitions,
             seconds=self.seconds,
             batches_per_reply=self.batches_per_reply,
+            soak_seconds=self.soak_seconds,
         )
 
 
@@ -119,17 +130,18 @@ def replay_command(options: ReplayBenchConfig) -> int:
         "sizes": dataclasses.asdict(sizes),
         "sections": {},
     }
-    console = printer()
+    console, held = printer(), True
     with _interruptible():
         for name in ALL:
             if name not in options.sections:
                 continue
             found = report["sections"][name] = list(SECTIONS[name](sizes, peer))
+            held &= all(row.get("held", True) for row in found)
             if options.json != "-":
                 for table in bench_replay_print.tables(name, found):
                     console.print(table)
     write_report(report, json_path=options.json, plot=options.plot, figures=_figures)
-    return 0
+    return int(not held)
 
 
 @contextlib.contextmanager

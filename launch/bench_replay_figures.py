@@ -1,8 +1,10 @@
 """The figures of `slipstream bench replay`, each as PNG and SVG."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
@@ -11,6 +13,7 @@ from launch.bench_figures import encoded
 from launch.bench_replay_sections import medians
 
 Row = Mapping[str, Any]
+SOAKED: Final = {"service": "#d55e00", "writer": "#0072b2", "reader": "#009e73"}
 COLOURS: Final = {"slipstream": "#0072b2", "torchrl": "#009e73", "reverb": "#d55e00"}
 
 
@@ -22,6 +25,8 @@ def figures(report: Mapping[str, Any]) -> dict[str, bytes]:
         drawn["replay_throughput"] = throughput_figure(sections["throughput"])
     if "scale" in sections:
         drawn["replay_scale"] = scale_figure(sections["scale"])
+    if "soak" in sections:
+        drawn["replay_soak"] = soak_figure(sections["soak"])
     return {
         f"{name}.{kind}": encoded(figure, kind)
         for name, figure in drawn.items()
@@ -100,4 +105,43 @@ def scale_figure(rows: Sequence[Row]) -> Figure:
         axes.set_ylabel(label)
         axes.grid(visible=True, alpha=0.35)
     panels[0].legend(fontsize=8)
+    return figure
+
+
+def soak_figure(rows: Sequence[Row]) -> Figure:
+    """Memory of the processes and samples per insert over the time; kills as lines."""
+    figure = _blank(
+        "Soak: service red, writers blue, readers green; lines: kill -9 of the service "
+        "(red) and of clients (grey)"
+    )
+    found = [row for row in rows if row["what"] == "look"]
+    memory, ratio = figure.subplots(2, 1, sharex=True)
+    lives = dict.fromkeys(life for row in found for life in row["processes"])
+    for life in lives:
+        seen = [row for row in found if life in row["processes"]]
+        memory.plot(
+            [row["seconds"] for row in seen],
+            [row["processes"][life]["own"] / 2**20 for row in seen],
+            color=SOAKED[life.split()[0].rstrip(",")],
+            linewidth=1.0,
+        )
+    told = [row for row in found if row.get("inserts", 0) > 0]
+    inserts = np.array([row["inserts"] for row in told], float)
+    samples = np.array([row["samples"] for row in told], float)
+    ratio.plot(
+        [row["seconds"] for row in told][1:],
+        np.diff(samples) / np.maximum(np.diff(inserts), 1.0),
+        "k.",
+        markersize=3,
+    )
+    for one, other in itertools.pairwise(found):
+        for role, count in other["kills"].items():
+            if count > one["kills"][role]:
+                colour = "#d55e00" if role == "service" else "0.8"
+                for axes in (memory, ratio):
+                    axes.axvline(other["seconds"], color=colour, zorder=0, lw=0.8)
+    memory.set_ylim(bottom=0)
+    memory.set_ylabel("own memory [MiB]")
+    ratio.set_ylabel("samples per insert\nbetween looks")
+    ratio.set_xlabel("time [s]")
     return figure

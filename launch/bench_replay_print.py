@@ -7,6 +7,7 @@ from typing import Any, Final
 from rich.table import Table
 
 from launch.bench_replay_sections import medians, ratios
+from launch.bench_soak_verdict import MOST_BYTES, MOST_RATIO_ERROR, WINDOW
 
 Row = Mapping[str, Any]
 # Peer, ours by shared memory, the peer by shared memory: how many times.
@@ -28,6 +29,8 @@ def tables(section: str, rows: Sequence[Row]) -> Iterator[Table]:
         yield _ratios(rows, WANTED)
     elif section == "memory":
         yield _memory(rows)
+    elif section == "soak":
+        yield _soak(next(row for row in rows if row["what"] == "verdict"))
     elif section == "scale":
         yield _scale([row for row in rows if row["what"] == "scale"])
         yield _model(next(row for row in rows if row["what"] == "model"))
@@ -178,4 +181,38 @@ def _model(row: Row) -> Table:
     table.add_row("shards", str(row["shards"]))
     for link, rate in row["bytes_per_s"].items():
         table.add_row(link.replace("_", " "), f"{rate / 1e6:,.1f} MB/s")
+    return table
+
+
+def _soak(row: Row) -> Table:
+    kills = ", ".join(f"{count} of the {role}s" for role, count in row["kills"].items())
+    table = _table(
+        f"Soak: {'held' if row['held'] else 'did not hold'}",
+        "what",
+        "found",
+        "allowed",
+        caption="\n".join(row["faults"]),
+    )
+    for name, memory in row["memory"].items():
+        grown = memory["growth_bytes_in_600_s"] / 2**20
+        error = memory["error_bytes_in_600_s"] / 2**20
+        table.add_row(
+            f"growth of the {name}, which takes {memory['bytes'] / 2**20:.0f} MiB",
+            f"{grown:.2f} +- {error:.2f} MiB in 600 s",
+            f"{MOST_BYTES / 2**20:g}",
+        )
+    if row["leak_found_bytes_per_query"] is not None:
+        lost = f"{row['leak_found_bytes_per_query']:.0f} B"
+        table.add_row("a leak per query that would be a fault", lost, "")
+    if row["worst_ratio_error"] is not None:
+        table.add_row(
+            f"error of the ratio over {WINDOW:,} inserts",
+            f"{row['worst_ratio_error']:.2%}",
+            f"{MOST_RATIO_ERROR:.0%}",
+        )
+    owed = f"{row['most_owed_in_tolerances']:.2f} tolerances"
+    table.add_row("samples owed, either way", owed, "1")
+    table.add_row("rows inserted", f"{row['inserts']:,}", "")
+    table.add_row("rows sampled", f"{row['samples']:,}", "")
+    table.add_row("kill -9", kills, "")
     return table

@@ -40,6 +40,7 @@ class Sizes:
     memory_rows: tuple[tuple[int, int], ...] = ((8192, 1 << 14), (128, 1 << 19))
     shards: tuple[int, ...] = (1, 2, 3, 4)
     writers: tuple[int, ...] = (1, 4, 16, 64)
+    soak_seconds: float = 600.0
 
     def workload(self, **changes: Any) -> Workload:  # noqa: ANN401 - any of its fields
         """Rows of 8 KB unless `changes` says something else."""
