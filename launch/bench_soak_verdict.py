@@ -15,7 +15,7 @@
               from 0 on in order, all that were told to be acknowledged, and no more
               samples received than were counted
 
-The slope is of least squares through the medians of eight equal parts of the time. A
+The slope is of least squares through the medians of eight equal parts of the looks. A
 leak is steady, so medians keep it; what comes and goes with a kill falls out, and parts
 of half a minute are nearly independent, where looks two seconds apart are not: their
 error would be told too small. The verdict says how many bytes lost per query would have
@@ -53,15 +53,12 @@ class Slope(NamedTuple):
 
 
 def slope_of(ages: np.ndarray, values: np.ndarray) -> Slope | None:
-    """Through the medians of equal parts of the time; None if one has no two looks."""
+    """Through the medians of equal parts of the looks; None if one has no two."""
     if len(ages) < 2 * _PARTS:
         return None
-    edges = np.linspace(ages[0], ages[-1], _PARTS + 1)[1:-1]
-    part = np.searchsorted(edges, ages)
-    if np.bincount(part, minlength=_PARTS).min() < 2:
-        return None
-    x = np.array([ages[part == one].mean() for one in range(_PARTS)])
-    y = np.array([np.median(values[part == one]) for one in range(_PARTS)])
+    # Not equal parts of the time: whoever stops the soak for a while leaves a gap.
+    x = np.array([part.mean() for part in np.array_split(ages, _PARTS)])
+    y = np.array([np.median(part) for part in np.array_split(values, _PARTS)])
     spread = ((x - x.mean()) ** 2).sum()
     per_s = float(((x - x.mean()) * y).sum() / spread)
     left = y - y.mean() - per_s * (x - x.mean())

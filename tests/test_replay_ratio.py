@@ -9,8 +9,8 @@ whichever is worse.
 
 With S samples per insert and a tolerance of e samples, |(I - m) S - S_drawn| <= e at
 every moment once filled, so over a window of W rows the samples are off by at most 2 e
-of S W. The settings put that at half a percent: 1% must hold, and a limiter two and a
-half times as loose need not hold it (the last test shows that it is found).
+of S W. The settings put that at half a percent: 1% must hold, and a limiter three
+times as loose need not hold it (the last test shows that it is found).
 """
 
 import contextlib
@@ -128,11 +128,11 @@ def test_ratio_is_within_a_hundredth_over_any_ten_thousand_inserts(
     print(f"{writers} writers: {error:.2%}")
 
 
-@pytest.mark.parametrize(("looser", "found"), [(1, False), (2.5, True)])
+@pytest.mark.parametrize(("looser", "found"), [(1, False), (3, True)])
 def test_a_limiter_that_is_too_loose_is_found(looser: float, found: bool) -> None:
     """Each side in turn goes as far as it may, once in every half window."""
     limiter = replace(CONFIG, tolerance=looser * CONFIG.tolerance).limiter()
-    inserts, samples, marks, step = MIN_SIZE, 0, [], 32
+    inserts, samples, marks, step = MIN_SIZE, 0, [], 16
     while inserts < 4 * WINDOW:
         now = {"inserts": inserts, "deletes": 0, "samples": samples}
         ahead = inserts // WINDOW % 2 == 0  # who goes first: the writers
