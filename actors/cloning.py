@@ -19,7 +19,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from actors import mixture
-from actors.mixture import Choice, action_limits, policy_outputs, split_mixture
+from actors.mixture import (
+    Choice,
+    action_limits,
+    inertia,
+    policy_outputs,
+    shifted,
+    split_mixture,
+)
 from actors.network import NetworkConfig, batched
 from actors.rows import row_spec
 from sim import dynamics
@@ -172,7 +179,8 @@ def cloned(
         state: Float[Array, "5"],
         values: Float[Array, " outputs"],
     ) -> Float[Array, "5"]:
-        distribution = split_mixture(values, len(limits))
+        going_on = inertia(jnp.hypot(state[3], state[4]), config.action, config.dt)
+        distribution = shifted(split_mixture(values, len(limits)), going_on)
         if choice == "sample":
             scaled = mixture.sample(key, distribution)
         else:

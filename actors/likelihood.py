@@ -16,11 +16,18 @@ from jaxtyping import Array, Float, Int
 
 from actors import mixture
 from actors.cloning import expert_rows, sdc_only
-from actors.mixture import action_limits, policy_outputs, split_mixture
+from actors.mixture import (
+    action_limits,
+    inertia,
+    policy_outputs,
+    shifted,
+    split_mixture,
+)
 from actors.network import NetworkConfig, batched
 from actors.rows import columns_of, render_before
 from sim.bank import BankFile
 from sim.environment import EnvironmentConfig
+from sim.features import SPEED_SCALE
 from sim.observation import Observation, observation_sizes
 
 MOST_ROWS: Final = 2048  # drawn once
@@ -92,7 +99,16 @@ def _log_probs(
         if not components:
             every = jax.nn.log_softmax(values, -1)
             return jnp.take_along_axis(every, index[:, None], -1)[:, 0]
-        split = functools.partial(split_mixture, components=scaled.shape[1])
-        return jax.vmap(mixture.log_prob)(jax.vmap(split)(values), scaled)
+
+        def one(
+            values: Float[Array, " outputs"],
+            ego: Float[Array, " ego"],
+            action: Float[Array, " components"],
+        ) -> Float[Array, ""]:
+            going_on = inertia(ego[0] * SPEED_SCALE, config.action, config.dt)
+            split = split_mixture(values, action.shape[0])
+            return mixture.log_prob(shifted(split, going_on), action)
+
+        return jax.vmap(one)(values, observation.ego, scaled)
 
     return jax.jit(log_probs)

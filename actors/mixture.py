@@ -10,6 +10,10 @@ with s = `SMALLEST` + softplus(r). An action is scaled by the limits of its spac
 (`action_limits`), symmetric also where the grid is not: Delta's grid goes forward only,
 but a car at rest would then lie at the squashed range's end.
 
+Means are relative to going on as before (`inertia`): a Delta action is a distance, of
+which a thousandth of the limit too much in each step is an acceleration of 0.3 m/s^2
+that never ends, for the next step starts from the speed that it led to.
+
 Recorded actions beyond a limit are cut to it. There u is infinite: `LARGEST` bounds
 |a|, so that what lies at the limit counts as u = 7.3.
 """
@@ -25,6 +29,7 @@ from sim.dynamics import ActionConfig, ActionSpace
 
 SMALLEST = 0.005  # of a deviation, before squashing: 1.5 cm of Delta's 3 m
 LARGEST = 1.0 - 1e-6
+FASTEST = 0.995  # of a limit, from which on what keeps the speed is not told apart
 FIRST_SCALE = 0.3  # of an untrained mixture
 Choice = Literal["mode", "mean", "sample"]
 _NODES, _NODE_WEIGHTS = np.polynomial.hermite.hermgauss(16)
@@ -59,6 +64,20 @@ def policy_outputs(config: ActionConfig, mixture: int) -> int:
     return mixture * (1 + 2 * len(action_limits(config)))
 
 
+def inertia(
+    speed: Float[Array, ""], config: ActionConfig, dt: float
+) -> Float[Array, " components"]:
+    """The scaled action that keeps speed [m/s] and heading, before squashing.
+
+    0 where actions are accelerations; of Delta's, the distance ahead.
+    """
+    still = jnp.zeros(len(action_limits(config)))
+    if config.space != ActionSpace.DELTA:
+        return still
+    scaled = jnp.clip(speed * (dt / config.forward), 0.0, FASTEST)
+    return still.at[0].set(jnp.arctanh(scaled))
+
+
 def split_mixture(outputs: Float[Array, " outputs"], components: int) -> Mixture:
     """A network's outputs as a mixture over actions of so many components."""
     count = outputs.shape[0] // (1 + 2 * components)
@@ -68,6 +87,11 @@ def split_mixture(outputs: Float[Array, " outputs"], components: int) -> Mixture
         means=rest[0],
         scales=SMALLEST + jax.nn.softplus(rest[1]),
     )
+
+
+def shifted(mixture: Mixture, by: Float[Array, " components"]) -> Mixture:
+    """The same distribution elsewhere, before squashing."""
+    return mixture._replace(means=mixture.means + by[None])
 
 
 def log_prob(mixture: Mixture, action: Float[Array, " components"]) -> Float[Array, ""]:

@@ -21,7 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 from launch.bench_output import check_outputs, write_report
-from launch.config import BudgetConfig, quick
+from launch.budget import BudgetConfig
+from launch.config import quick
 from launch.errors import LaunchError
 from launch.supervisor import Outcome
 from launch.train import TrainConfig, prepare, supervise

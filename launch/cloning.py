@@ -24,6 +24,7 @@ import numpy as np
 
 from actors.cloning import expert_rows, expert_steps, moving_vehicles, sdc_only
 from actors.rows import columns_of, render_before
+from actors.straying import strayed
 from launch.config import FILL_ROWS, ExperimentConfig, RunFile, row_spec_of
 from launch.errors import LaunchError
 from launch.join import JoinConfig, Joined, joined, train_bank
@@ -49,6 +50,7 @@ COLUMNS: Final = (
 )
 _WAIT_S: Final = 0.5  # between two looks at the reasons to stop
 _FLUSH_S: Final = 30.0
+Draw = Callable[[], np.ndarray | None]
 Render = Callable[[np.ndarray], Observation]
 
 
@@ -79,6 +81,7 @@ def make_cloner(config: ExperimentConfig) -> CloningLearner:
         network=config.network,
         sizes=observation_sizes(config.environment.observation),
         action=config.environment.action,
+        dt=config.environment.dt,
     )
 
 
@@ -87,6 +90,19 @@ def make_render_before(file: BankFile, config: ExperimentConfig) -> Render:
     observation = config.environment.observation
     compiled = jax.jit(functools.partial(render_before, config=observation))
     return lambda rows: compiled(file.bank, columns_of(rows))
+
+
+def with_straying(draw: Draw, config: ExperimentConfig, updates: int) -> Draw:
+    """Batches of which a share has strayed; other ones at each number of updates."""
+    rng = np.random.default_rng([config.seed, 1, updates])
+
+    def drawn() -> np.ndarray | None:
+        rows = draw()
+        if rows is None:
+            return None
+        return strayed(rows, rng, config.straying, config.environment)
+
+    return drawn
 
 
 def resume_cloning(learner: CloningLearner, folder: Path) -> float:
@@ -228,7 +244,8 @@ def clone_from_replay(place: Joined, stop: threading.Event) -> None:
             return None
 
     render = make_render_before(train_bank(place), config)
-    for step in clone(learner=learner, sample=sample, render=render):
+    draw = with_straying(sample, config, learner.updates)
+    for step in clone(learner=learner, sample=draw, render=render):
         if step is not None:
             reporter.add(step)
         reporter.look()

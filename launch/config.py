@@ -1,11 +1,12 @@
 """The configuration of a run: the components' configurations, budget and scenes.
 
 One frozen dataclass is the command line, `config.json` of the run folder and what the
-processes of a run share. Two presets:
+processes of a run share. Three presets:
 
     quick   learns to drive on two cores in minutes: a small network, few road rows, a
             progress reward (the paper's reward is satisfied by standing still), a
             higher learning rate, averaged weights; the README lists what differs
+    laptop  the same with a larger network, for 45 minutes and 2,000 scenes
     paper   appendix A.2 of the Waymax paper, else Acme's: the components' defaults,
             with a network of the paper's width
 
@@ -32,6 +33,8 @@ from actors.network import (
     quick_network,
 )
 from actors.rows import row_spec
+from actors.straying import StrayingConfig
+from launch.budget import BudgetConfig, EvaluatorConfig, ReportConfig, ScenesConfig
 from launch.errors import LaunchError
 from learner.config import CloningConfig, LearnerConfig
 from replay.local import ReplayConfig
@@ -46,74 +49,6 @@ Algorithm = Literal["dqn", "bc"]
 Cloned = Literal["sdc", "vehicles"]  # whose actions: the recording vehicle's, or of all
 FILL_ROWS: Final = 1024  # of a batch by which a bank pass fills the replay
 UNBOUNDED: Final = 1e9  # a limiter's tolerance that no run comes near
-
-
-@dataclass(frozen=True, kw_only=True)
-class BudgetConfig:
-    """When a run is over; whichever comes first."""
-
-    updates: int = 3_750_000
-    """Updates of the learner (the paper's 30 million steps at ratio 8, batch 64)."""
-    minutes: float = 0.0
-    """Minutes since the first update, over all restarts; 0 is no limit."""
-
-    def __post_init__(self) -> None:
-        """Refuses a run that is over before it begins."""
-        if self.updates < 1 or self.minutes < 0:
-            raise ValueError(
-                f"budget: updates={self.updates} must be at least 1 and minutes="
-                f"{self.minutes} not negative"
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScenesConfig:
-    """Scenes made by the procedural generator."""
-
-    train: int = 256
-    """Scenes to train on."""
-    held_out: int = 64
-    """Scenes to evaluate on, of another seed."""
-    seed: int = 0
-    """Of the generator."""
-    held_out_share: float = 0.2
-    """Of recorded scenes, this share is held out, at least one if there are two."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReportConfig:
-    """What a run writes down, and how often."""
-
-    checkpoint_s: float = 30.0
-    """Seconds between two checkpoints."""
-    checkpoints: int = 3
-    """Newest checkpoints kept."""
-    curves_s: float = 2.0
-    """Seconds between two rows of the curves."""
-    tensorboard: bool = True
-    """Write TensorBoard events beside the CSV file."""
-    rollouts: int = 12
-    """Evaluation rollouts recorded for the viewer."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluatorConfig:
-    """The evaluation beside the training: `launch.evaluator`."""
-
-    scenes: int = 64
-    """Held-out scenes that each checkpoint drives, the first ones; 0: no evaluator."""
-    seconds: float = 60.0
-    """From the beginning of an evaluation to the next one's, at least."""
-    updates: int = 0
-    """Updates from an evaluated checkpoint to the next one, at least."""
-
-    def __post_init__(self) -> None:
-        """Refuses negative numbers."""
-        for name in ("scenes", "seconds", "updates"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(
-                    f"evaluator: {name}={getattr(self, name)} must not be negative"
-                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +67,8 @@ class ExperimentConfig:
     """Double DQN's updates."""
     cloning: CloningConfig = field(default_factory=CloningConfig)
     """Behaviour cloning's updates."""
+    straying: StrayingConfig = field(default_factory=StrayingConfig)
+    """Behaviour cloning's rows off the log."""
     budget: BudgetConfig = field(default_factory=BudgetConfig)
     """When the run is over."""
     scenes: ScenesConfig = field(default_factory=ScenesConfig)
@@ -191,7 +128,23 @@ def paper() -> ExperimentConfig:
     return ExperimentConfig(network=paper_network(), replay=ReplayConfig(durable=True))
 
 
-PRESETS: Final = {"quick": quick, "paper": paper}
+def laptop() -> ExperimentConfig:
+    """Double DQN within 45 minutes on two cores, on 2,000 scenes."""
+    config = quick()
+    return dataclasses.replace(
+        config,
+        network=laptop_network(),
+        # The learner is what is slow: more is driven for each of its updates.
+        replay=dataclasses.replace(
+            config.replay, capacity=500_000, samples_per_insert=2.0
+        ),
+        learner=dataclasses.replace(config.learner, learning_rate=3e-4),
+        budget=BudgetConfig(updates=1_000_000, minutes=40.0),
+        scenes=ScenesConfig(train=2000, held_out=200),
+    )
+
+
+PRESETS: Final = {"quick": quick, "laptop": laptop, "paper": paper}
 
 
 def quick_cloning() -> ExperimentConfig:
@@ -205,6 +158,7 @@ def quick_cloning() -> ExperimentConfig:
             average_updates=1000,
             torch_threads=2,  # no actors beside it
         ),
+        straying=StrayingConfig(share=0.5),
     )
 
 

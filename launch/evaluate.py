@@ -26,7 +26,12 @@ from actors.controlled import (
 from actors.evaluation import Evaluation, Judge, evaluate
 from actors.frames import FrameBatch
 from actors.policy import Policy, find_policy, greedy, random_vector, read_policy
-from launch.config import ExperimentConfig, RunFile, ScenesConfig, write_atomically
+from launch.budget import ScenesConfig
+from launch.config import (
+    ExperimentConfig,
+    RunFile,
+    write_atomically,
+)
 from launch.drivers import PLAYBACK, Driver, built_in, check_step, driver_of
 from launch.errors import LaunchError
 from launch.failures import failures_json, failures_of, others_json, plot_intervals

@@ -19,7 +19,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from launch.config import ScenesConfig
+from launch.budget import ScenesConfig
 from launch.converting import Places, Tally, gathering, processors, say
 from launch.errors import LaunchError
 from sim.bank import BankFile, is_bank, open_bank, verify

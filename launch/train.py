@@ -53,7 +53,7 @@ LOGS: Final = "logs"
 class TrainConfig:
     """Trains double DQN with actors, replay and learner on this machine."""
 
-    preset: Literal["quick", "paper"] = "quick"
+    preset: Literal["quick", "laptop", "paper"] = "quick"
     """The settings that all others start from."""
     scenes: tuple[str, ...] = (PROCEDURAL,)
     """Files or folders of recorded scenes, one or two banks, or `procedural`."""

@@ -31,6 +31,7 @@ from launch.cloning import (
     make_render_before,
     resume_cloning,
     rows_to_clone,
+    with_straying,
 )
 from launch.config import (
     ExperimentConfig,
@@ -138,9 +139,13 @@ def clone_serially(folder: Path, run: RunFile) -> None:
     reporter = CloneReporter(
         learner=learner, config=config, folder=folder, before_s=before_s, saved=saved
     )
+
+    def draw() -> np.ndarray:
+        return rows[rng.integers(0, len(rows), config.cloning.batch_size)]
+
     steps = clone(
         learner=learner,
-        sample=lambda: rows[rng.integers(0, len(rows), config.cloning.batch_size)],
+        sample=with_straying(draw, config, learner.updates),
         render=make_render_before(train, config),
     )
     for step in steps:

@@ -5,6 +5,7 @@
 with p a softmax over the grid's actions, or a tanh-squashed Gaussian mixture over
 continuous actions scaled to [-1, 1] by their limits (`learner.mixture`); the density's
 unit is that of the scaled action, so the likelihoods of two spaces do not compare.
+Delta's means are relative to going on at the same speed (`actors.mixture.inertia`).
 Adam, batches drawn uniformly. The paper leaves a mixture's first weights open: here its
 means start apart, at standard normals before squashing, for components that start
 equal stay equal.
@@ -23,7 +24,12 @@ from torch import Tensor, nn
 from actors.mixture import FIRST_SCALE, action_limits, policy_outputs
 from actors.network import Layout, NetworkConfig, parameter_layout
 from learner.config import CloningConfig
-from learner.mixture import mixture_log_prob, softmax_log_prob, split_mixture
+from learner.mixture import (
+    mixture_log_prob,
+    shifted,
+    softmax_log_prob,
+    split_mixture,
+)
 from learner.network import QNetwork, follow_average, to_torch, to_vector
 from learner.training import (
     compute_device,
@@ -34,6 +40,7 @@ from learner.training import (
     training_state,
 )
 from sim.dynamics import ActionConfig
+from sim.features import SPEED_SCALE
 from sim.observation import Observation, ObservationSizes
 
 
@@ -63,8 +70,17 @@ class CloningLearner:
         network: NetworkConfig,
         sizes: ObservationSizes,
         action: ActionConfig,
+        dt: float = 0.1,
     ) -> None:
-        """Draws the first weights from the seed. Sets torch's thread count."""
+        """Draws the first weights from the seed. Sets torch's thread count.
+
+        Args:
+            config: the updates.
+            network: the policy's sizes.
+            sizes: of the observation.
+            action: the space.
+            dt: a step's length [s].
+        """
         if config.mixture and network.dueling:
             raise ValueError("dueling is for values, not for a mixture: switch it off")
         torch.set_num_threads(config.torch_threads)
@@ -73,6 +89,7 @@ class CloningLearner:
         self.sizes = sizes
         self.actions = policy_outputs(action, config.mixture)
         self.updates = 0
+        self._action, self._dt = action, dt
         self._device = compute_device(config.device)
         self._limits = torch.from_numpy(action_limits(action)).to(self._device)
         generator = torch.Generator().manual_seed(config.seed)
@@ -158,13 +175,20 @@ class CloningLearner:
         self, network: QNetwork, batch: CloningBatch
     ) -> Float[Tensor, " batch"]:
         with in_precision(self.config.precision, self._device):
-            outputs = network(*to_torch(batch.observation_tm1, self._device)).float()
+            seen = to_torch(batch.observation_tm1, self._device)
+            outputs = network(*seen).float()
         if not self.config.mixture:
             index = torch.from_numpy(np.ascontiguousarray(batch.a_tm1))
             return softmax_log_prob(outputs, index.to(self._device).long())
         action = torch.from_numpy(np.ascontiguousarray(batch.continuous_tm1))
         scaled = action.to(self._device) / self._limits
-        return mixture_log_prob(split_mixture(outputs, len(self._limits)), scaled)
+        distribution = shifted(
+            split_mixture(outputs, len(self._limits)),
+            seen[0][:, 0] * SPEED_SCALE,  # `sim.features.own_features`
+            self._action,
+            self._dt,
+        )
+        return mixture_log_prob(distribution, scaled)
 
 
 def held_out(learner: CloningLearner, batches: Iterable[CloningBatch]) -> float:

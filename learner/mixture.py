@@ -12,7 +12,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from actors.mixture import LARGEST, SMALLEST
+from actors.mixture import FASTEST, LARGEST, SMALLEST
+from sim.dynamics import ActionConfig, ActionSpace
 
 
 class Mixture(NamedTuple):
@@ -32,6 +33,21 @@ def split_mixture(outputs: Float[Tensor, "batch outputs"], components: int) -> M
         means=rest[:, 0],
         scales=SMALLEST + F.softplus(rest[:, 1]),
     )
+
+
+def shifted(
+    mixture: Mixture,
+    speed: Float[Tensor, " batch"],
+    config: ActionConfig,
+    dt: float,
+) -> Mixture:
+    """With means relative to what keeps the speed [m/s]: `actors.mixture.inertia`."""
+    if config.space != ActionSpace.DELTA:
+        return mixture
+    scaled = (speed * (dt / config.forward)).clamp(0.0, FASTEST)
+    going_on = torch.zeros_like(mixture.means[:, :1])
+    going_on[..., 0] = torch.atanh(scaled)[:, None]
+    return mixture._replace(means=mixture.means + going_on)
 
 
 def mixture_log_prob(

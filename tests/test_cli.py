@@ -65,7 +65,7 @@ def test_a_person_without_a_command_gets_the_list(
         (["train"], "expected dqn"),
         (["train", "ppo"], "expected dqn or bc and not ppo"),
         (["scenes", "eat"], "convert or info or procedural"),
-        (["train", "dqn", "--preset", "slow"], "choose one of quick, paper"),
+        (["train", "dqn", "--preset", "slow"], "choose one of quick, laptop, paper"),
         (["train", "dqn", "--spped", "1"], "--spped"),
         (["train", "dqn", "--actors", "many"], "many"),
         (["train", "dqn", "--actors", "0"], "actors=0 must be at least 1"),

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from launch.bench import measured
-from launch.config import BudgetConfig, quick
+from launch.budget import BudgetConfig
+from launch.config import quick
 from launch.console import line_of, snapshot, time_left
 from launch.doctor import CHECKS, Finding, examine
 from launch.errors import LaunchError

@@ -15,12 +15,9 @@ from actors.cloning import cloned, expert_rows, sdc_only
 from actors.evaluation import Judge, evaluate
 from actors.likelihood import HeldOutLikelihood
 from actors.policy import find_policy, random_vector
+from launch.budget import BudgetConfig, EvaluatorConfig, ReportConfig, ScenesConfig
 from launch.config import (
-    BudgetConfig,
-    EvaluatorConfig,
-    ReportConfig,
     RunFile,
-    ScenesConfig,
     decode_run,
     quick,
     quick_cloning,

@@ -14,6 +14,7 @@ from actors import mixture as twin
 from learner.mixture import (
     Mixture,
     mixture_log_prob,
+    shifted,
     softmax_log_prob,
     split_mixture,
 )
@@ -176,3 +177,26 @@ def test_outputs_and_limits_of_the_spaces():
     np.testing.assert_allclose(twin.action_limits(delta), [3.0, 0.2, 0.2])
     steering = ActionConfig(space=ActionSpace.STEERING)
     np.testing.assert_allclose(twin.action_limits(steering), [6.0, 9.0])
+
+
+def test_an_untrained_delta_mixture_goes_on_as_before():
+    """One sharp component at 0: the action is v dt ahead, and the same in torch."""
+    config = ActionConfig(space=ActionSpace.DELTA)
+    outputs = torch.tensor([[0.0, 0.0, 0.0, 0.0, -20.0, -20.0, -20.0]])
+    limits = twin.action_limits(config)
+    for speed in (0.0, 0.3, 12.0, 29.0):
+        going_on = twin.inertia(jnp.float32(speed), config, 0.1)
+        split = twin.shifted(twin.split_mixture(jnp.array(outputs[0]), 3), going_on)
+        for choose in (twin.mode, twin.mean):
+            expected = [0.1 * speed, 0.0, 0.0]
+            np.testing.assert_allclose(choose(split) * limits, expected, atol=1e-3)
+        theirs = shifted(split_mixture(outputs, 3), torch.tensor([speed]), config, 0.1)
+        np.testing.assert_allclose(theirs.means[0], split.means, atol=1e-5)
+    beyond = [twin.inertia(jnp.float32(v), config, 0.1)[0] for v in (29.9, 80.0)]
+    assert beyond[0] == beyond[1] < 3.0
+
+
+def test_accelerations_are_relative_to_none():
+    mixture = split_mixture(random_mixture(components=2)[0], 2)
+    assert shifted(mixture, torch.ones(16), ActionConfig(), 0.1) is mixture
+    assert not twin.inertia(jnp.float32(5.0), ActionConfig(), 0.1).any()

@@ -6,7 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from launch.config import BudgetConfig, ExperimentConfig, paper, quick
+from launch.budget import BudgetConfig
+from launch.config import (
+    ExperimentConfig,
+    paper,
+    quick,
+)
 from launch.join import REPLAY, SCENES, TRAIN
 from launch.learning import make_learner
 from launch.roles import ActorStatus

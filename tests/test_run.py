@@ -18,7 +18,11 @@ import psutil
 import pytest
 
 from actors.rows import row_spec
-from launch.config import BudgetConfig, quick, read_run
+from launch.budget import BudgetConfig
+from launch.config import (
+    quick,
+    read_run,
+)
 from launch.join import free_port
 from replay.client import fetch_rows, fetch_stats
 from replay.keys import RunKeys

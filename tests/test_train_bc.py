@@ -17,13 +17,11 @@ import pytest
 
 from actors.policy import find_policy, read_policy
 from actors.rows import row_spec
+from launch.budget import BudgetConfig, ReportConfig, ScenesConfig
 from launch.cloning import COLUMNS, count_rows, dealt
 from launch.config import (
     CLONING_PRESETS,
-    BudgetConfig,
     ExperimentConfig,
-    ReportConfig,
-    ScenesConfig,
     decode_run,
     paper_cloning,
     read_run,
@@ -53,6 +51,7 @@ def test_the_papers_constants():
     )
     assert (config.network.mlp_layers, config.network.mlp_width) == (4, 128)
     assert cloning.max_gradient_norm == cloning.average_updates == 0
+    assert config.straying.share == 0
 
 
 @pytest.mark.parametrize(
