@@ -21,10 +21,19 @@ samples. Write d = (I - m) s - S, the samples owed.
 With `max_times_sampled` M > 0 a row is removed at its M-th draw, so the table can fall
 below m again while samples are owed. Then, and while filling, inserts of any size are
 allowed as long as I - D < m (Reverb's rule for one item at a time), or the batch that
-crosses m could be held for ever. Two further conditions:
+crosses m could be held for ever. Three further conditions:
 
 - S <= M I always, so the ratio can only be met if s <= M;
-- m rows have at least m draws left, so samples of b <= m rows are always possible.
+- m rows have at least m draws left, so samples of b <= m rows are always possible;
+- what is let in below m, where nobody looks at the samples owed, must not push out rows
+  with draws left: those would be owed for ever, and more with every batch (measured:
+  0.25 samples per insert for 1). From m - 1 rows on there must be room for a batch, so
+  the capacity is at least m + a - 1.
+
+Then a FIFO table keeps the ratio. Samplers that draw at random leave some rows undrawn
+for so long that the ring pushes them out: their draws are lost, and with s = M the
+samples fall behind by as much (1% for prioritised rows, s = M = 8 and a capacity of
+16 m); a larger M makes up for them.
 """
 
 from dataclasses import dataclass
@@ -46,6 +55,7 @@ class RateLimiter:
     min_size: int
     tolerance: float  # e, in samples
     max_times_sampled: int = 0  # M; 0 is no limit
+    capacity: int | None = None  # rows; None: there is room for any number
 
     def __post_init__(self) -> None:
         """Refuses settings that mean nothing."""
@@ -99,13 +109,7 @@ class RateLimiter:
         filling = (insert_rows - 1) * self.samples_per_insert
         if self.max_times_sampled:
             filling = 0.0
-            if sample_rows > self.min_size:
-                raise LimiterError(
-                    f"rate limiter would deadlock: min_size={self.min_size} rows may "
-                    f"have one draw left each (max_times_sampled="
-                    f"{self.max_times_sampled}), too few for samples of {sample_rows}; "
-                    "raise min_size or use smaller batches"
-                )
+            self._check_removal(insert_rows=insert_rows, sample_rows=sample_rows)
         if self.tolerance >= max(both, filling):
             return
         if self.tolerance < both:
@@ -125,3 +129,21 @@ class RateLimiter:
             f"{self.tolerance:g}: {why}; raise the tolerance or min_size, or use "
             "smaller batches"
         )
+
+    def _check_removal(self, *, insert_rows: int, sample_rows: int) -> None:
+        """The conditions on batches where rows are removed once drawn so often."""
+        if sample_rows > self.min_size:
+            raise LimiterError(
+                f"rate limiter would deadlock: min_size={self.min_size} rows may have "
+                f"one draw left each (max_times_sampled={self.max_times_sampled}), too "
+                f"few for samples of {sample_rows}; raise min_size or use smaller "
+                "batches"
+            )
+        needed = self.min_size + insert_rows - 1
+        if self.capacity is not None and self.capacity < needed:
+            raise LimiterError(
+                f"the ratio would drift: with max_times_sampled="
+                f"{self.max_times_sampled} inserts of {insert_rows} rows are let in "
+                f"below min_size={self.min_size} and would push out rows that are owed "
+                f"draws; capacity={self.capacity} must be at least {needed}"
+            )

@@ -71,6 +71,7 @@ class ReplayConfig:
             min_size=self.min_size,
             tolerance=self.tolerance * self.samples_per_insert * self.min_size,
             max_times_sampled=self.max_times_sampled,
+            capacity=self.capacity,
         )
 
     def part_of(self, shards: int, shard: int = 0) -> "ReplayConfig":

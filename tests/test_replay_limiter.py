@@ -1,12 +1,17 @@
 """The limiter against its definition, and against deadlock."""
 
+import math
+
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from replay.limiter import LimiterError, RateLimiter
-from replay.local import ReplayConfig
+from replay.local import LocalReplay, ReplayConfig
+from replay.selectors import SamplerName
 from replay.spec import ReplayError
+from tests.replay_parts import SPEC, make_rows
 
 counts = st.integers(0, 400)
 
@@ -181,3 +186,118 @@ def test_the_border_is_where_deadlock_begins(
     with pytest.raises(LimiterError, match="would deadlock"):
         refused.check_batches(insert_rows=a, sample_rows=b)
     assert can_stick(refused, a, b, capacity)
+
+
+def removing(
+    spi: float,
+    m: int,
+    a: int,
+    b: int,
+    *,
+    sampler: SamplerName,
+    most: int,
+    capacity: int,
+    tolerance: float,
+) -> LocalReplay:
+    """A real table whose rows are removed once drawn so often; raises if refused."""
+    config = ReplayConfig(
+        capacity=capacity,
+        min_size=m,
+        samples_per_insert=spi,
+        tolerance=tolerance / (spi * m),
+        sampler=sampler,
+        max_times_sampled=most,
+    )
+    config.limiter().check_batches(insert_rows=a, sample_rows=b)
+    return LocalReplay(spec=SPEC, config=config, seed=0)
+
+
+def work(replay: LocalReplay, a: int, b: int, *, steps: int, seed: int) -> float:
+    """Steps in a random order; the samples owed at the end in tolerances."""
+    random = np.random.default_rng(seed)
+    eager = random.random()  # how much the writers are ahead
+    for _ in range(steps):
+        inserted, drawn = random.integers(1, [a, b], endpoint=True).tolist()
+        if replay.may_insert(a) and random.random() < eager:
+            replay.insert(make_rows(replay.inserts, a))
+        elif replay.may_insert(inserted) and random.random() < eager:
+            replay.insert(make_rows(replay.inserts, inserted))
+        elif replay.may_sample(drawn):
+            ids = replay.sample(drawn).ids
+            # Also of no priority at all: what is left of the others is used up first.
+            replay.update_priorities(ids, random.integers(0, 3, drawn) * 0.5)
+        assert replay.may_insert(a) or replay.may_sample(b)
+    replay.table.check_invariants()
+    debt = replay.limiter.debt(inserts=replay.inserts, samples=replay.samples)
+    return debt / replay.limiter.tolerance
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    spi=st.sampled_from([0.3, 0.5, 1.0, 2.0, 2.5]),
+    m=st.integers(1, 12),
+    a=st.integers(1, 8),
+    b=st.integers(1, 8),
+    spare=st.integers(0, 3),
+    sampler=st.sampled_from(["prioritized", "uniform", "fifo"]),
+    seed=st.integers(0, 1 << 30),
+)
+def test_removal_at_every_border_at_once_blocks_nobody(
+    spi: float, m: int, a: int, b: int, spare: int, sampler: SamplerName, seed: int
+) -> None:
+    """M, tolerance, capacity and m as small as accepted; one less of each is refused.
+
+    And a FIFO table, which loses no draws, does not fall behind.
+    """
+    m = max(m, b)
+    border = {
+        "sampler": sampler,
+        "most": math.ceil(spi),
+        "capacity": m + a - 1,
+        "tolerance": (b + a * spi) / 2 + 1e-9,
+    }
+    wider = {**border, "capacity": m + a - 1 + spare}
+    debt = work(removing(spi, m, a, b, **wider), a, b, steps=60, seed=seed)
+    if sampler == "fifo":
+        # One batch below m beside the tolerance, and rows of which some draws are left.
+        assert debt <= 1 + (a * spi + (a + b) * border["most"]) / border["tolerance"]
+    with pytest.raises(ReplayError, match=r"would drift|wait for ever"):
+        removing(spi, m, a, b, **{**border, "capacity": m + a - 2})
+    narrow = 0.99 * border["tolerance"]
+    with pytest.raises(LimiterError, match="would deadlock"):
+        removing(spi, m, a, b, **{**border, "tolerance": narrow})
+    with pytest.raises(LimiterError, match="one draw left each"):
+        removing(spi, m, a, m + 1, **{**border, "tolerance": 1e3})
+    if border["most"] > 1:
+        with pytest.raises(LimiterError, match="samples can never exceed"):
+            removing(spi, m, a, b, **{**border, "most": border["most"] - 1})
+
+
+@pytest.mark.parametrize("sampler", ["uniform", "fifo"])
+@pytest.mark.parametrize(("capacity", "drifts"), [(10, True), (16, False)])
+def test_refused_capacities_do_drift(
+    sampler: SamplerName, capacity: int, drifts: bool
+) -> None:
+    """The refusal is right: the samples fall behind without end, else they do not."""
+    a, b, most = 4, 1, 2
+    config = ReplayConfig(
+        capacity=capacity,
+        min_size=10,
+        samples_per_insert=1.0,
+        tolerance=0.3,
+        sampler=sampler,
+        max_times_sampled=most,
+    )
+    replay = LocalReplay(spec=SPEC, config=config, seed=0)
+    for _ in range(600):
+        if replay.may_insert(a):
+            replay.insert(make_rows(replay.inserts, a))
+        else:
+            replay.sample(b)
+    debt = replay.limiter.debt(inserts=replay.inserts, samples=replay.samples)
+    assert (debt > 50 * replay.limiter.tolerance) == drifts
+    if drifts:
+        with pytest.raises(LimiterError, match=r"would drift.*at least 13"):
+            config.limiter().check_batches(insert_rows=a, sample_rows=b)
+    else:
+        assert abs(debt) <= replay.limiter.tolerance
