@@ -16,7 +16,8 @@ from launch.bench_replay_runs import Contestant, Crew, Crewed
 from launch.bench_replay_sections import OURS, PRESET, TORCHRL, Row, Sizes
 from launch.config import PRESETS
 from launch.converting import say
-from replay.wire import Insert, SampleReplyBuffer, SampleRequest
+from replay.wire import SampleReplyBuffer, SampleRequest
+from replay.wire_inserts import Insert
 
 FACTOR: Final = 4  # between the two numbers of rows
 KILOBYTES: Final = 8192  # of the rows that peers are compared on

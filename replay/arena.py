@@ -6,7 +6,7 @@ lie; the service gathers rows straight into that place, and only a header travel
 
 The memory is an anonymous file (`memfd_create`): it has no name in any folder and is
 gone with the last process that has it mapped, however that ends. It begins with
-a random token; a `Place` names process, descriptor, offset and token. The service opens
+a random token; a place names process, descriptor, offset and token. The service opens
 `/proc/PID/fd/FD`. Another machine, another container or another user's process has no
 such file, or one without that token: then the answer travels as a whole. So nothing has
 to be configured, and a wrong guess is impossible.
@@ -26,7 +26,6 @@ one throws the whole arena away.
 import mmap
 import os
 import secrets
-import struct
 import sys
 import time
 import weakref
@@ -37,6 +36,8 @@ from typing import final
 import numpy as np
 from jaxtyping import UInt8
 
+from replay.places import MemoryPlace
+
 TOKEN_BYTES = 16
 HEAD_BYTES = 4096  # before the first part: the token
 ALIGNMENT = 64
@@ -44,31 +45,6 @@ MAX_ARENA_BYTES = 1 << 30
 MAX_MAPPED = 256  # arenas of others
 IDLE_S = 10.0  # after which they are let go of; opening one again takes 0.1 ms
 _NAME = "slipstream"
-_PLACE = struct.Struct("<IIQ16s")
-
-
-@final
-@dataclass(frozen=True, kw_only=True)
-class Place:
-    """Where in which process's memory something lies or may lie."""
-
-    pid: int
-    fd: int
-    offset: int  # bytes from the start of the file
-    token: bytes
-
-    def encode(self) -> bytes:
-        """32 bytes."""
-        return _PLACE.pack(self.pid, self.fd, self.offset, self.token)
-
-    @staticmethod
-    def decode(data: bytes, offset: int) -> "Place | None":
-        """The place at `offset` of a message; process 0 stands for none."""
-        pid, fd, start, token = _PLACE.unpack_from(data, offset)
-        return Place(pid=pid, fd=fd, offset=start, token=token) if pid else None
-
-
-NO_PLACE = bytes(_PLACE.size)
 
 
 @final
@@ -88,19 +64,23 @@ class Arena:
         self._free = [HEAD_BYTES + part * stride for part in reversed(range(parts))]
         self._lent: dict[int, weakref.ref[np.ndarray]] = {}
 
-    def take(self) -> Place | None:
+    def take(self) -> MemoryPlace | None:
         """A part that nobody uses, or None."""
         if not self._free:
             return None
-        return Place(
+        return MemoryPlace(
             pid=os.getpid(), fd=self._fd, offset=self._free.pop(), token=self._token
         )
 
-    def give_back(self, place: Place) -> None:
+    def room(self, place: MemoryPlace, length: int) -> memoryview:
+        """The first bytes of the part, to be written by this process."""
+        return self._memory.data[place.offset : place.offset + length]
+
+    def give_back(self, place: MemoryPlace) -> None:
         """The part was not used."""
         self._free.append(place.offset)
 
-    def view(self, place: Place, length: int) -> UInt8[np.ndarray, " length"]:
+    def view(self, place: MemoryPlace, length: int) -> UInt8[np.ndarray, " length"]:
         """The first bytes of the part; it is free when no view of them is left."""
         # An array of its own: views of it keep it alive, and not each other's parts.
         whole = np.frombuffer(self._memory.data, np.uint8, length, place.offset)
@@ -173,7 +153,7 @@ class Arenas:
         """How many are mapped now."""
         return len(self._mapped)
 
-    def part(self, place: Place, length: int) -> memoryview | None:
+    def part(self, place: MemoryPlace, length: int) -> memoryview | None:
         """The `length` bytes at the place, or None if this process cannot see them."""
         memory = self._memory_of(place)
         inside = HEAD_BYTES <= place.offset <= place.offset + length
@@ -191,7 +171,7 @@ class Arenas:
                 return
             del self._mapped[key]  # unmapped with the last view of it
 
-    def _memory_of(self, place: Place) -> mmap.mmap | None:
+    def _memory_of(self, place: MemoryPlace) -> mmap.mmap | None:
         key = (place.pid, place.fd, place.token)
         known = self._mapped.get(key)
         if known is None:
@@ -205,7 +185,7 @@ class Arenas:
         return known.memory
 
 
-def _open_sealed(place: Place) -> mmap.mmap | None:
+def _open_sealed(place: MemoryPlace) -> mmap.mmap | None:
     """Maps the file if it is what the place says; the module says what is checked."""
     path = f"/proc/{place.pid}/fd/{place.fd}"
     try:

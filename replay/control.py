@@ -82,6 +82,14 @@ class StatsReply(Message, frozen=True, kw_only=True, tag=True):
 
 
 @final
+class StreamOffer(Message, frozen=True, kw_only=True, tag=True):
+    """Where large answers may be had by a connection of their own."""
+
+    ports: dict[str, Annotated[int, msgspec.Meta(ge=1, le=65535)]]  # by numeric host
+    token: Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
+
+
+@final
 class StatusMessage(Message, frozen=True, kw_only=True, tag=True):
     """A role's own counters, for the console."""
 

@@ -10,7 +10,7 @@ import struct
 
 from replay.spec import ReplayError
 
-WIRE_VERSION = 4
+WIRE_VERSION = 5
 MAGIC = b"SLST"
 HEADER_BYTES = 64
 MAX_ROWS = 1 << 20  # per message
@@ -45,6 +45,7 @@ class Status(enum.IntEnum):
     GAP = 2  # not the next sequence; go back to the one in the reply
     STALE = 3  # a newer process writes under this number
     REFUSED = 4  # it can never be accepted; the reason says why
+    ABSENT = 5  # the rows are not where the message says; send them along
 
 
 def header(kind: Kind, schema_hash: bytes, rest: bytes) -> bytes:

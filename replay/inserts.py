@@ -5,6 +5,7 @@ admitted within the time that its sender allows is answered "busy", and so are t
 writer's later ones: without it they could not be stored.
 """
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -15,11 +16,13 @@ import zenoh
 from replay.counters import Counters
 from replay.ledger import Ledger, Verdict, WriterState
 from replay.local import LocalReplay
+from replay.places import MemoryPlace
 from replay.records import MAX_WRITERS
 from replay.requests import HeldInsert, answer, end, payload_of
 from replay.spec import ReplayError, RowSpec
 from replay.storage import WriterMark
-from replay.wire import Insert, InsertReply, Status
+from replay.wire import Status
+from replay.wire_inserts import Insert, InsertReply
 
 MAX_WAITING = 64  # batches of one writer
 MAX_WAITING_BYTES = 256 << 20  # of all
@@ -56,14 +59,20 @@ class InsertDesk:
         counters: Counters,
         incarnation: int,
         check_rows: Callable[[int], None],
+        part: Callable[[MemoryPlace, int], memoryview | None],
     ) -> None:
-        """Takes up the writers that the replay knows; `check_rows` refuses sizes."""
+        """Takes up the writers that the replay knows; `check_rows` refuses sizes.
+
+        `part`: the memory in which a writer of this machine has put rows.
+        """
         self._spec = spec
         self._replay = replay
         self._counters = counters
         self._incarnation = incarnation
         self._check_rows = check_rows
+        self._part = part
         self._held: deque[HeldInsert] = deque()
+        self._due = math.inf  # none has to be answered earlier
         self._told = ""  # the fault that was said
         self.ledger: Ledger[HeldInsert] = Ledger(MAX_WRITERS)
         for mark in replay.writers:
@@ -80,7 +89,7 @@ class InsertDesk:
     def take(self, query: zenoh.Query, arrived: float) -> None:
         """Judges a batch: it waits, or is answered at once."""
         try:
-            message = Insert.decode(payload_of(query), self._spec)
+            message = Insert.decode(payload_of(query), self._spec, self._part)
             self._check_rows(len(message.rows))
         except ReplayError as error:
             self._counters.refused += 1
@@ -93,6 +102,9 @@ class InsertDesk:
                 reason=str(error),
             )
             answer(query, reply.encode(self._spec))
+            return
+        if not len(message.rows):
+            self._ask_for_rows(message, query)
             return
         verdict, state = self.ledger.judge(
             writer=message.writer,
@@ -109,6 +121,7 @@ class InsertDesk:
         elif verdict is Verdict.NEXT:
             state.waiting.append(held)
             self._held.append(held)
+            self._due = min(self._due, held.deadline)
         elif verdict is Verdict.REPLACES:
             earlier = state.waiting[message.sequence - state.next_sequence]
             end(earlier.query)
@@ -116,6 +129,17 @@ class InsertDesk:
             earlier.message = message
         else:
             self._answer_unstored(held, verdict)
+
+    def _ask_for_rows(self, message: Insert, query: zenoh.Query) -> None:
+        """Its rows lie where this process cannot read; nothing is judged by that."""
+        reply = InsertReply(
+            status=Status.ABSENT,
+            writer=message.writer,
+            epoch=message.epoch,
+            next_sequence=message.base,
+            incarnation=self._incarnation,
+        )
+        answer(query, reply.encode(self._spec))
 
     def _is_full(self, state: WriterState[HeldInsert]) -> bool:
         """Whether as much waits as may: the writer sends it again soon."""
@@ -186,13 +210,16 @@ class InsertDesk:
         self._acknowledge(held, Status.OK)
         return True
 
-    def deadlines(self) -> list[float]:
-        """When held batches must be answered, `time.monotonic`."""
-        return [held.deadline for held in self._held]
+    @property
+    def due(self) -> float:
+        """No held batch must be answered before, `time.monotonic`."""
+        return self._due
 
     def expire(self, now: float) -> None:
         """Answers "busy" to what has waited as long as it may."""
         self._tell_fault()
+        if now < self._due:
+            return
         for held in [h for h in self._held if h.deadline <= now]:
             for late in held.state.waiting:
                 if late.query is not None:
@@ -200,8 +227,8 @@ class InsertDesk:
                     self._counters.busy_inserts += 1
                     self._acknowledge(late, Status.BUSY, self._replay.fault)
             held.state.waiting.clear()
-        if any(h.query is None for h in self._held):
-            self._held = deque(h for h in self._held if h.query is not None)
+        self._held = deque(h for h in self._held if h.query is not None)
+        self._due = min((h.deadline for h in self._held), default=math.inf)
 
     def _tell_fault(self) -> None:
         """Says once that inserts stop and why, and once that they go on."""

@@ -68,6 +68,11 @@ class RunKeys:
         return f"slipstream/{self.run_id}/replay/{self.shard}/sync"
 
     @property
+    def stream(self) -> str:
+        """Queries for where sampled rows may be had by a stream."""
+        return f"slipstream/{self.run_id}/replay/{self.shard}/stream"
+
+    @property
     def claims(self) -> str:
         """Liveliness of whoever serves this shard, or is about to."""
         return f"slipstream/{self.run_id}/claims/{self.shard}/*"

@@ -6,7 +6,8 @@ from typing import final
 import zenoh
 
 from replay.ledger import WriterState
-from replay.wire import Insert, SampleRequest
+from replay.wire import SampleRequest
+from replay.wire_inserts import Insert
 
 
 @final

@@ -29,9 +29,11 @@ from replay.inserts import InsertDesk
 from replay.keys import RunKeys
 from replay.limiter import LimiterError
 from replay.local import LocalReplay, ReplayConfig
+from replay.places import Place, StreamPlace
 from replay.requests import HeldSample, answer, end, payload_of
 from replay.session import direct, undeclare
 from replay.spec import ReplayError, RowSpec
+from replay.streams import ReplyStreams
 from replay.table import PriorityError
 from replay.wire import (
     MAX_REPLY_BYTES,
@@ -85,14 +87,16 @@ class ReplayServer:
         self._samples: deque[HeldSample] = deque()
         self._syncs: deque[tuple[int, zenoh.Query, StatsReply]] = deque()
         self._counters = Counters(recovered=self._replay.size)
+        self._arenas = Arenas()
         self._inserts = InsertDesk(
             spec=spec,
             replay=self._replay,
             counters=self._counters,
             incarnation=self._incarnation,
             check_rows=lambda rows: self._check_batches(insert_rows=rows),
+            part=self._arenas.part,
         )
-        self._arenas = Arenas()
+        self._streams = ReplyStreams()
         # The last reply's: Zenoh has copied it, and fresh pages cost a fault each.
         self._payload = bytearray()
         self._hub = hub
@@ -112,6 +116,7 @@ class ReplayServer:
             "sample": (self._keys.sample, self._on_sample),
             "fetch": (self._keys.fetch, self._on_fetch),
             "stats": (self._keys.stats, self._on_stats),
+            "stream": (self._keys.stream, self._on_stream),
             "sync": (self._keys.sync, self._on_sync),
         }
         queryables = [
@@ -136,6 +141,7 @@ class ReplayServer:
         finally:
             undeclare(*queryables)
             self._let_go()
+            self._streams.close()
             self._replay.close()
 
     def _next_events(self) -> Iterator[tuple[str, zenoh.Query, float]]:
@@ -187,17 +193,27 @@ class ReplayServer:
             return False
         held = self._samples.popleft()
         place = held.message.place
+        body = self._body_at(place, body_bytes(self._spec, held.count))
         buffer = self._replay.sample_into_buffer(
             batch_size=held.message.batch_size,
             batches=held.message.batches,
             payload=self._payload,
-            place=place
-            and self._arenas.part(place, body_bytes(self._spec, held.count)),
+            place=body,
         )
         self._payload = buffer.payload
         self._counters.sample_wait_s += time.monotonic() - held.arrived
         answer(held.query, self._sealed(buffer))
+        if body is not None and isinstance(place, StreamPlace):
+            self._streams.put(place, body)
         return True
+
+    def _body_at(self, place: Place | None, length: int) -> memoryview | None:
+        """Where the reply's body is to be put; None: behind its header."""
+        if place is None:
+            return None
+        if isinstance(place, StreamPlace):
+            return self._streams.room(place, length)
+        return self._arenas.part(place, length)
 
     # Both
 
@@ -231,11 +247,9 @@ class ReplayServer:
 
     def _next_deadline(self) -> float:
         """Seconds until a held request must be answered, 0.1 at most."""
-        deadlines = self._inserts.deadlines()
-        deadlines += [held.deadline for held in self._samples]
-        if not deadlines:
-            return _LONGEST_WAIT_S
-        return min(_LONGEST_WAIT_S, max(0.0, min(deadlines) - time.monotonic()))
+        due = min([h.deadline for h in self._samples], default=self._inserts.due)
+        left = min(due, self._inserts.due) - time.monotonic()
+        return min(_LONGEST_WAIT_S, max(0.0, left))
 
     def _expire(self) -> None:
         """Answers "busy" to what has waited as long as it may."""
@@ -292,6 +306,9 @@ class ReplayServer:
             incarnation=self._incarnation,
             pending_samples=len(self._samples),
         )
+
+    def _on_stream(self, query: zenoh.Query, _: float) -> None:
+        answer(query, encode(self._streams.offer(self._session)))
 
     def _on_sync(self, query: zenoh.Query, _: float) -> None:
         """The counters, once all that they count is on the disk."""

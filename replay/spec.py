@@ -23,6 +23,10 @@ class ReplayError(Exception):
     """Replay cannot go on; the message says what, where and what to do."""
 
 
+class ReplayTimeout(ReplayError):
+    """Nothing could be sampled in the time given; asking again is fine."""
+
+
 @final
 @dataclass(frozen=True)
 class Field:

@@ -11,16 +11,17 @@ Every header begins with the same 16 bytes:
 and is padded to 64 bytes, so that rows behind it stay aligned.
 
     Insert        writer u32, rows u32, epoch u64, sequence u64, base u64,
-                  hold ms u32, life u64; then rows
+                  hold ms u32, life u64, placed u32; then rows, or, if placed,
+                  where they lie (`replay.places`)
     InsertReply   status u16, writer u32, epoch u64, next sequence u64,
                   incarnation u64; then the reason as UTF-8
     SampleRequest batch size u32, batches u32, updates u32, hold ms u32, and where
-                  the reply's body may lie: pid u32 (0: nowhere), fd u32, offset u64,
-                  token [16]; then ids u64[updates], priorities f64[updates]
+                  the reply's body may lie (`replay.places`); then ids u64[updates],
+                  priorities f64[updates]
     FetchRequest  limit u32, first id u64
     SampleReply   status u16, placed u16, rows u32, size u64, inserts u64,
                   mass f64; then ids u64[rows], probabilities f64[rows], rows (where
-                  the request said, if placed: `replay.arena`); or the reason.
+                  the request said, if placed); or the reason.
                   It also answers FetchRequest (size and inserts bound the ids)
     Weights       values u32, version i64, layout hash ASCII[24]; then f32[values]
 """
@@ -31,9 +32,9 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
+import zenoh
 from jaxtyping import Float, UInt8, UInt64
 
-from replay.arena import NO_PLACE, Place
 from replay.header import (
     COMMON,
     HEADER_BYTES,
@@ -54,6 +55,11 @@ from replay.header import (
     reason_of,
     status_of,
 )
+from replay.places import (
+    Place,
+    decode_place,
+    encode_place,
+)
 from replay.spec import RowSpec, Sample
 
 __all__ = [
@@ -62,8 +68,6 @@ __all__ = [
     "MAX_REPLY_BYTES",
     "WIRE_VERSION",
     "FetchRequest",
-    "Insert",
-    "InsertReply",
     "SampleReply",
     "SampleReplyBuffer",
     "SampleRequest",
@@ -72,103 +76,13 @@ __all__ = [
     "WireError",
     "body_bytes",
     "encode_sample_refusal",
+    "is_placed",
 ]
 
-_INSERT = struct.Struct("<IIQQQIQ")
-_INSERT_REPLY = struct.Struct("<HxxIQQQ")
 _SAMPLE_REQUEST = struct.Struct("<IIII")  # and a place
 _SAMPLE_REPLY = struct.Struct("<HHIQQd")
 _FETCH_REQUEST = struct.Struct("<IxxxxQ")
 _WEIGHTS = struct.Struct("<Ixxxxq24s")
-
-
-@final
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Insert:
-    """Writer to service: the batch `sequence` of a writer's life `epoch`."""
-
-    writer: int
-    epoch: int  # grows when the writer's process restarts
-    sequence: int
-    base: int  # the lowest sequence that the writer knows no acknowledgement of
-    hold_ms: int  # the service may hold its answer so long
-    rows: UInt8[np.ndarray, "rows row_bytes"]
-    life: int = 0  # random; tells two processes of one number and epoch apart
-
-    def encode(self, spec: RowSpec) -> bytes:
-        """Header, then the rows' bytes."""
-        head = _INSERT.pack(
-            self.writer,
-            len(self.rows),
-            self.epoch,
-            self.sequence,
-            self.base,
-            self.hold_ms,
-            self.life,
-        )
-        return header(Kind.INSERT, spec.schema_hash, head) + self.rows.tobytes()
-
-    @staticmethod
-    def decode(payload: bytes, spec: RowSpec) -> "Insert":
-        """Parses and checks; the rows are a view of the payload."""
-        open_header(payload, Kind.INSERT, spec.schema_hash)
-        writer, count, epoch, sequence, base, hold_ms, life = _INSERT.unpack_from(
-            payload, COMMON.size
-        )
-        check_count(Kind.INSERT, "rows", count, MAX_ROWS)
-        check_length(payload, Kind.INSERT, count * spec.row_bytes)
-        check_count(Kind.INSERT, "as its number", max(epoch, sequence), MAX_NUMBER)
-        if count == 0 or base > sequence:
-            raise WireError(
-                f"INSERT: {count} rows as sequence {sequence} after {base}; a batch "
-                "has rows and follows what it builds on"
-            )
-        rows = np.frombuffer(payload, np.uint8, offset=HEADER_BYTES)
-        return Insert(
-            writer=writer,
-            epoch=epoch,
-            sequence=sequence,
-            base=base,
-            hold_ms=min(hold_ms, MAX_HOLD_MS),
-            rows=rows.reshape(count, spec.row_bytes),
-            life=life,
-        )
-
-
-@final
-@dataclass(frozen=True, kw_only=True)
-class InsertReply:
-    """Service to writer: all below `next_sequence` is stored."""
-
-    status: Status
-    writer: int
-    epoch: int
-    next_sequence: int
-    incarnation: int  # of the service's process; changes when it restarts
-    reason: str = ""
-
-    def encode(self, spec: RowSpec) -> bytes:
-        """Header, then the reason."""
-        head = _INSERT_REPLY.pack(
-            self.status, self.writer, self.epoch, self.next_sequence, self.incarnation
-        )
-        return header(Kind.INSERT_REPLY, spec.schema_hash, head) + self.reason.encode()
-
-    @staticmethod
-    def decode(payload: bytes, spec: RowSpec) -> "InsertReply":
-        """Parses and checks."""
-        open_header(payload, Kind.INSERT_REPLY, spec.schema_hash)
-        status, writer, epoch, next_sequence, incarnation = _INSERT_REPLY.unpack_from(
-            payload, COMMON.size
-        )
-        return InsertReply(
-            status=status_of(status, Kind.INSERT_REPLY),
-            writer=writer,
-            epoch=epoch,
-            next_sequence=next_sequence,
-            incarnation=incarnation,
-            reason=reason_of(payload, Kind.INSERT_REPLY),
-        )
 
 
 @final
@@ -188,7 +102,7 @@ class SampleRequest:
         head = _SAMPLE_REQUEST.pack(
             self.batch_size, self.batches, len(self.ids), self.hold_ms
         )
-        head += self.place.encode() if self.place else NO_PLACE
+        head += encode_place(self.place)
         return (
             header(Kind.SAMPLE_REQUEST, spec.schema_hash, head)
             + self.ids.astype("<u8").tobytes()
@@ -218,7 +132,7 @@ class SampleRequest:
             priorities=np.frombuffer(
                 payload, "<f8", updates, HEADER_BYTES + 8 * updates
             ),
-            place=Place.decode(payload, COMMON.size + _SAMPLE_REQUEST.size),
+            place=decode_place(payload, COMMON.size + _SAMPLE_REQUEST.size),
         )
 
 
@@ -245,6 +159,14 @@ class FetchRequest:
         return FetchRequest(first_id=first_id, limit=limit)
 
 
+def is_placed(payload: zenoh.ZBytes) -> bool:
+    """Whether a sample reply's body lies or comes elsewhere; reads the header only."""
+    if len(payload) != HEADER_BYTES:
+        return False
+    status, placed, *_ = _SAMPLE_REPLY.unpack_from(payload.to_bytes(), COMMON.size)
+    return bool(status == Status.OK and placed)
+
+
 def body_bytes(spec: RowSpec, count: int) -> int:
     """Bytes of the ids, probabilities and rows of a sample reply."""
     return count * (16 + spec.row_bytes)
@@ -262,7 +184,7 @@ class SampleReplyBuffer:
         payload: bytearray | None = None,
         place: memoryview | None = None,
     ) -> None:
-        """Room for `count` rows: at `place`, or in the message behind the header.
+        """Room for `count` rows: in `place`, or in the message behind the header.
 
         `payload`: a former message, used again if it has the right length.
         """

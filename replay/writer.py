@@ -14,6 +14,7 @@ that has lost its memory takes up the writer there: batches below it were acknow
 
 What the writer does with an answer:
 
+    ABSENT    the rows lie in memory that the service cannot read: send them along
     OK, and any answer's `next_sequence`   forget all batches below it
     BUSY      the limiter held it as long as allowed: send again at once
     GAP       send again from the first unacknowledged batch
@@ -32,14 +33,18 @@ from typing import final
 import numpy as np
 import zenoh
 
+from replay.arena import Arena, make_arena
 from replay.keys import RunKeys
-from replay.session import direct
+from replay.places import MemoryPlace
+from replay.session import direct, shares_memory
 from replay.spec import ReplayError, RowSpec
-from replay.wire import Insert, InsertReply, Status, WireError
+from replay.wire import Status, WireError
+from replay.wire_inserts import Insert, InsertReply
 
 _ANSWER_MARGIN_S = 5.0  # between the service's last moment to answer and giving up
 _BACK_OFF_S = (0.02, 1.0)  # first and longest
 _GAP_PAUSE_S = 0.005
+_LEAST_PLACED_BYTES = 64 << 10  # of a batch: smaller ones cost less in the message
 _END_S = 1.0  # that is waited for the sending thread
 
 
@@ -48,6 +53,7 @@ _END_S = 1.0  # that is waited for the sending thread
 class _Batch:
     sequence: int
     rows: np.ndarray  # [rows, row_bytes] uint8
+    place: MemoryPlace | None  # of the rows
 
 
 @final
@@ -80,7 +86,11 @@ class Writer:
         self._life = secrets.randbits(64)
         self._limit = window
         self._hold_s = hold_s
-        self._partial = np.zeros(batch_rows, spec.dtype)
+        self._batch_rows = batch_rows
+        self._arena = self._make_arena(session)
+        self._may_place = self._arena is not None
+        self._part: MemoryPlace | None = None
+        self._partial = self._empty_batch()
         self._filled = 0
         # Everything below is guarded by the condition.
         self._changed = threading.Condition()
@@ -97,6 +107,21 @@ class Writer:
         self._closed = False
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
+
+    def _make_arena(self, session: zenoh.Session) -> Arena | None:
+        """For the window and the batch under way, if that is worth it."""
+        batch_bytes = self._batch_rows * self._spec.row_bytes
+        if batch_bytes < _LEAST_PLACED_BYTES or not shares_memory(session):
+            return None
+        return make_arena(parts=self._limit + 2, part_bytes=batch_bytes)
+
+    def _empty_batch(self) -> np.ndarray:
+        """Memory for the next rows: where a service of this machine can read them."""
+        self._part = self._arena.take() if self._arena and self._may_place else None
+        if self._arena is None or self._part is None:
+            return np.zeros(self._batch_rows, self._spec.dtype)
+        room = self._arena.room(self._part, self._batch_rows * self._spec.row_bytes)
+        return np.frombuffer(room, self._spec.dtype)
 
     @property
     def acknowledged(self) -> int:
@@ -177,12 +202,20 @@ class Writer:
             self._raise_error()
             if not admitted:
                 return False
-            rows = self._spec.as_bytes(self._partial[: self._filled]).copy()
-            self._window.append(_Batch(sequence=self._next_sequence, rows=rows))
+            self._window.append(self._batch())
             self._next_sequence += 1
             self._filled = 0
             self._changed.notify_all()
+        self._partial = self._empty_batch()
         return True
+
+    def _batch(self) -> _Batch:
+        """The filled rows; their part of the arena is free when the batch is."""
+        width = self._spec.row_bytes
+        rows = self._spec.as_bytes(self._partial[: self._filled])
+        if self._arena is not None and self._part is not None:
+            rows = self._arena.view(self._part, self._filled * width).reshape(-1, width)
+        return _Batch(sequence=self._next_sequence, rows=rows, place=self._part)
 
     def _run(self) -> None:
         """The sending thread: whatever of the window has not been sent."""
@@ -235,6 +268,7 @@ class Writer:
             hold_ms=int(self._hold_s * 1e3),
             rows=batch.rows,
             life=self._life,
+            place=batch.place if self._may_place else None,
         )
         self._session.get(
             self._key,
@@ -269,6 +303,7 @@ class Writer:
                 )
             elif (reply.writer, reply.epoch) == (self._writer, self._epoch):
                 self._failures = 0
+                self._may_place &= reply.status is not Status.ABSENT
                 self._forget_below(reply.next_sequence)
                 if reply.status is not Status.OK and generation == self._generation:
                     pause = _GAP_PAUSE_S if reply.status is Status.GAP else 0.0

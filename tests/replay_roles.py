@@ -7,8 +7,9 @@
 
 The writer numbers its rows from `EPOCH * 1_000_000` and prints how many rows were
 acknowledged whenever that grows; the service prints `ready`. With a folder it is
-durable and its rows are checked ones; `checked` writes those until SIGTERM. The reader
-checks what it draws and prints how many answers came through shared memory.
+durable and its rows are checked ones; `checked` writes those until SIGTERM, and puts
+them into memory for the service to read if its number is odd. The reader checks what
+it draws and prints how many answers came through shared memory.
 """
 
 import signal
@@ -16,6 +17,7 @@ import sys
 import threading
 from pathlib import Path
 
+import replay.writer
 from replay.client import Sampler, Writer
 from replay.server import ReplayServer
 from replay.session import open_session
@@ -72,6 +74,8 @@ def write(endpoint: str, writer: int, epoch: int, rows: int) -> None:
 def write_checked(endpoint: str, writer: int, epoch: int) -> None:
     """Writes rows with checksums until SIGTERM, then tells how many are stored."""
     stop, start = until_term(), 0
+    if writer % 2:
+        replay.writer._LEAST_PLACED_BYTES = 1  # else these are too small
     session = open_session(connect=[endpoint], timeout_s=60.0)
     sink = Writer(
         session=session,

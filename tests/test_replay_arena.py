@@ -15,9 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from replay.arena import HEAD_BYTES, IDLE_S, MAX_MAPPED, Arena, Arenas, Place
+from replay.arena import HEAD_BYTES, IDLE_S, MAX_MAPPED, Arena, Arenas
 from replay.client import Sampler, Writer
 from replay.local import ReplayConfig
+from replay.places import MemoryPlace
 from replay.session import ask, open_session
 from replay.wire import SampleReply, SampleRequest, body_bytes
 from tests.replay_parts import KEYS, SPEC, Service, eventually, make_rows, service
@@ -35,7 +36,7 @@ FREE = ReplayConfig(
 
 
 @pytest.fixture
-def place() -> Iterator[Place]:
+def place() -> Iterator[MemoryPlace]:
     arena = Arena(parts=PARTS, part_bytes=PART_BYTES)
     taken = arena.take()
     assert taken is not None
@@ -61,14 +62,16 @@ def test_only_the_owners_memory_is_written_to(
     pid: int, fd: int, offset: int, length: int, token: bytes
 ) -> None:
     """The definition: its process, its file, its token, aligned, inside."""
-    part = Arenas().part(Place(pid=pid, fd=fd, offset=offset, token=token), length)
+    part = Arenas().part(
+        MemoryPlace(pid=pid, fd=fd, offset=offset, token=token), length
+    )
     right = (pid, fd, token) == (os.getpid(), GOOD.fd, GOOD.token)
     inside = HEAD_BYTES <= offset and offset + length <= SIZE and offset % 64 == 0
     assert (part is not None) == (right and inside)
     assert part is None or len(part) == length
 
 
-def test_what_the_service_writes_the_client_sees(place: Place) -> None:
+def test_what_the_service_writes_the_client_sees(place: MemoryPlace) -> None:
     arenas = Arenas()
     part = arenas.part(place, 5)
     assert part is not None
@@ -79,7 +82,9 @@ def test_what_the_service_writes_the_client_sees(place: Place) -> None:
 
 
 @pytest.mark.parametrize("fault", ["unsealed", "hollow", "small", "pipe", "file"])
-def test_other_files_are_not_mapped(fault: str, place: Place, tmp_path: Path) -> None:
+def test_other_files_are_not_mapped(
+    fault: str, place: MemoryPlace, tmp_path: Path
+) -> None:
     """Each could stop the service in the middle of a write, or is none of this."""
     spare: list[int] = []
     if fault == "pipe":
@@ -106,14 +111,14 @@ def test_other_files_are_not_mapped(fault: str, place: Place, tmp_path: Path) ->
             os.close(fd)
 
 
-def test_nobody_can_change_the_size(place: Place) -> None:
+def test_nobody_can_change_the_size(place: MemoryPlace) -> None:
     for size in (SIZE - 1, SIZE + 1):
         with pytest.raises(PermissionError):
             os.truncate(place.fd, size)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
-def test_another_users_memory_is_not_written_to(place: Place) -> None:
+def test_another_users_memory_is_not_written_to(place: MemoryPlace) -> None:
     assert Arenas().part(place, 64) is not None
     os.fchown(place.fd, 65534, 65534)
     assert Arenas().part(place, 64) is None
@@ -135,7 +140,7 @@ def test_a_process_that_is_gone() -> None:
     ) as other:
         assert other.stdout is not None
         pid, fd, offset, token = other.stdout.readline().split()
-        theirs = Place(
+        theirs = MemoryPlace(
             pid=int(pid), fd=int(fd), offset=int(offset), token=bytes.fromhex(token)
         )
         arenas = Arenas()
@@ -221,7 +226,7 @@ def test_rows_come_through_shared_memory_or_not_and_are_the_same() -> None:
 
 
 def test_a_place_that_is_not_there_is_answered_as_if_there_was_none(
-    place: Place,
+    place: MemoryPlace,
 ) -> None:
     with filled() as running:
         for wrong in (replace(place, token=bytes(16)), replace(place, pid=2**32 - 1)):

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,19 +16,19 @@ from replay.control import FileReply, FileRequest, StatusMessage, decode, encode
 from replay.files import FileServer
 from replay.ledger import Ledger, Verdict
 from replay.local import ReplayConfig
+from replay.places import StreamPlace
 from replay.session import ask
 from replay.spec import ReplayError
 from replay.wire import (
     MAX_NUMBER,
     FetchRequest,
-    Insert,
-    InsertReply,
     SampleReply,
     SampleReplyBuffer,
     SampleRequest,
     Status,
     WireError,
 )
+from replay.wire_inserts import Insert, InsertReply
 from tests.replay_parts import KEYS, SPEC, Service, eventually, make_rows, service
 
 CONFIG = ReplayConfig(
@@ -74,6 +75,7 @@ def works(running: Service, numbers: Iterator[int]) -> bool:
 NUMBERS = iter(range(100, 1000))
 VALID = [
     insert().encode(SPEC),
+    replace(insert(), place=StreamPlace(name=bytes(16), number=2)).encode(SPEC),
     SampleRequest(
         batch_size=2,
         batches=2,
@@ -101,7 +103,7 @@ def payloads(draw: st.DrawFn) -> bytes:
 
 @QUICK
 @given(
-    key=st.sampled_from(["insert", "sample", "fetch", "stats", "sync"]),
+    key=st.sampled_from(["insert", "sample", "fetch", "stats", "stream", "sync"]),
     payload=payloads(),
 )
 def test_any_bytes_are_answered_and_the_service_stays_up(
@@ -110,6 +112,7 @@ def test_any_bytes_are_answered_and_the_service_stays_up(
     with pytest.MonkeyPatch.context() as patch:
         # Some ask to be held as long as may be, and the limiter does hold them.
         patch.setattr("replay.wire.MAX_HOLD_MS", 100)
+        patch.setattr("replay.wire_inserts.MAX_HOLD_MS", 100)
         answered = ask(running.client, getattr(KEYS, key), payload, timeout_s=20.0)
     assert answered is not None
 

@@ -1,4 +1,8 @@
-"""kill -9 of a durable service under load: every acknowledged row exactly once."""
+"""kill -9 of a durable service under load: every acknowledged row exactly once.
+
+By all ways that rows take: every second writer puts them into memory of its own for the
+service to read, the learner draws through memory or by a stream.
+"""
 
 import contextlib
 import functools
@@ -15,6 +19,7 @@ import zenoh
 
 from replay.client import ReplayTimeout, Sampler, fetch_rows, fetch_stats
 from replay.local import LocalReplay
+from replay.session import open_session
 from tests.replay_durable_parts import CHECKED, LOADED, checked_rows, checksum
 from tests.replay_parts import KEYS, eventually, free_endpoint, session_to
 from tests.test_replay_processes import has_rows, role, wait_for_service
@@ -28,7 +33,7 @@ class Learner:
         self.received = 0
         self.bad = 0
         self._stop = threading.Event()
-        self._sampler = Sampler(
+        self.sampler = Sampler(
             session=session, keys=KEYS, spec=CHECKED, batch_size=32, hold_s=0.5
         )
         self._thread = threading.Thread(target=self._run)
@@ -37,7 +42,7 @@ class Learner:
     def _run(self) -> None:
         while not self._stop.is_set():
             with contextlib.suppress(ReplayTimeout):
-                sample = self._sampler.sample(0.5)
+                sample = self.sampler.sample(0.5)
                 self.received += len(sample.ids)
                 self.bad += int(sample.rows["crc"][0]) != checksum(sample.rows[0])
 
@@ -76,14 +81,18 @@ def check_rows(session: zenoh.Session, written: list[int]) -> int:
     return len(rows)
 
 
-def kill_under_load(folder: Path, *, kills: int, writers: int, seed: int) -> None:
+def kill_under_load(
+    folder: Path, *, kills: int, writers: int, seed: int, streamed: bool
+) -> None:
     """Kills the service at random moments, recovery included, then counts."""
     chance, endpoint = random.Random(seed), free_endpoint()
     with contextlib.ExitStack() as stack:
         service = stack.enter_context(role("service", endpoint, folder))
         wait_for_service(service)
         session = stack.enter_context(session_to(endpoint))
-        processes, learner = stack.enter_context(load(endpoint, session, writers))
+        drawn = open_session(connect=[endpoint], shared_memory=not streamed)
+        stack.callback(drawn.close)
+        processes, learner = stack.enter_context(load(endpoint, drawn, writers))
         assert eventually(lambda: has_rows(session, 200))
         stored = sampled = 0
         for turn in range(kills):
@@ -110,6 +119,8 @@ def kill_under_load(folder: Path, *, kills: int, writers: int, seed: int) -> Non
             enumerate(written)
         )
         assert learner.bad == 0
+        assert learner.sampler.streamed >= kills * streamed
+        assert learner.sampler.placed >= kills * (not streamed)
         # Drawn and not received: at most what was in flight at each kill and the end.
         lost = stats["samples"] - learner.received
         assert 0 <= lost <= (kills + 1) * 2 * 32
@@ -120,13 +131,23 @@ def kill_under_load(folder: Path, *, kills: int, writers: int, seed: int) -> Non
     again.close()
 
 
+@pytest.fixture(autouse=True)
+def by_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also for answers as small as these, and soon again after a kill."""
+    monkeypatch.setattr("replay.sampler.LEAST_BYTES", 1)
+    monkeypatch.setattr("replay.sampler._STREAM_RETRY_S", 0.1)
+
+
 def test_killed_under_load_it_keeps_every_acknowledged_row_once(tmp_path: Path) -> None:
-    kill_under_load(tmp_path / "replay", kills=3, writers=2, seed=0)
+    kill_under_load(tmp_path / "replay", kills=3, writers=2, seed=0, streamed=True)
 
 
 @pytest.mark.slow
-def test_fifty_kills_with_four_writers(tmp_path: Path) -> None:
-    kill_under_load(tmp_path / "replay", kills=50, writers=4, seed=1)
+@pytest.mark.parametrize("streamed", [False, True])
+def test_fifty_kills_with_four_writers(tmp_path: Path, streamed: bool) -> None:
+    kill_under_load(
+        tmp_path / "replay", kills=25, writers=4, seed=1 + streamed, streamed=streamed
+    )
 
 
 @pytest.mark.slow

@@ -11,7 +11,8 @@ from replay.client import ReplayTimeout, Sampler, Writer, fetch_rows, fetch_stat
 from replay.local import ReplayConfig
 from replay.session import ask
 from replay.spec import Field, ReplayError, RowSpec
-from replay.wire import Insert, InsertReply, SampleReply, SampleRequest, Status
+from replay.wire import SampleReply, SampleRequest, Status
+from replay.wire_inserts import Insert, InsertReply
 from tests.replay_parts import (
     KEYS,
     OPEN,

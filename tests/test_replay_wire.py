@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,12 +10,11 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from replay import control
+from replay.places import MemoryPlace
 from replay.spec import Field, ReplayError, RowSpec
 from replay.wire import (
     HEADER_BYTES,
     FetchRequest,
-    Insert,
-    InsertReply,
     SampleReply,
     SampleReplyBuffer,
     SampleRequest,
@@ -23,6 +23,7 @@ from replay.wire import (
     WireError,
     encode_sample_refusal,
 )
+from replay.wire_inserts import Insert, InsertReply
 from tests.replay_parts import SPEC, make_rows
 
 OTHER = RowSpec(
@@ -39,6 +40,11 @@ def insert() -> Insert:
         hold_ms=1500,
         rows=SPEC.as_bytes(make_rows(5, 9)),
     )
+
+
+def placed_insert() -> Insert:
+    place = MemoryPlace(pid=9, fd=7, offset=2**40, token=bytes(range(16)))
+    return replace(insert(), place=place)
 
 
 def insert_reply() -> InsertReply:
@@ -81,6 +87,11 @@ def weights() -> Weights:
 Decoder = Callable[[bytes], object]
 PAYLOADS: dict[str, tuple[bytes, Decoder, bool]] = {
     "Insert": (insert().encode(SPEC), lambda p: Insert.decode(p, SPEC), True),
+    "Insert of rows elsewhere": (
+        placed_insert().encode(SPEC),
+        lambda p: Insert.decode(p, SPEC),
+        True,
+    ),
     "InsertReply": (
         insert_reply().encode(SPEC),
         lambda p: InsertReply.decode(p, SPEC),
@@ -100,6 +111,7 @@ PAYLOADS: dict[str, tuple[bytes, Decoder, bool]] = {
     "Weights": (weights().encode(), Weights.decode, True),
 }
 SMALL_MESSAGES: list[control.Message] = [
+    control.StreamOffer(ports={"127.0.0.1": 65535}, token=bytes(16)),
     control.StatusMessage(role="actor-1", values={"steps": 3, "rate": 0.5, "x": "y"}),
     control.Stop(reason="learnt"),
     control.FileRequest(offset=5, length=7),
@@ -159,6 +171,18 @@ def test_insert_round_trip() -> None:
     assert (got.writer, got.epoch, got.hold_ms) == (7, 2**60, 1500)
     assert (got.sequence, got.base) == (2**40, 2**40 - 3)
     np.testing.assert_array_equal(got.rows, sent.rows)
+
+
+def test_rows_elsewhere_are_read_there_or_not_at_all() -> None:
+    sent = placed_insert()
+    data = sent.rows.tobytes()
+
+    def part(place: MemoryPlace, length: int) -> memoryview | None:
+        return memoryview(data)[:length] if place == sent.place else None
+
+    got = Insert.decode(sent.encode(SPEC), SPEC, part)
+    np.testing.assert_array_equal(got.rows, sent.rows)
+    assert len(Insert.decode(sent.encode(SPEC), SPEC).rows) == 0
 
 
 def test_insert_reply_round_trip() -> None:
@@ -271,6 +295,7 @@ def test_wrong_type_and_unknown_fields_are_refused() -> None:
 def test_another_row_layout_is_refused_with_both_hashes(name: str) -> None:
     payload, _, _ = PAYLOADS[name]
     kind = {"Insert": Insert, "InsertReply": InsertReply, "SampleReply": SampleReply}
+    kind["Insert of rows elsewhere"] = Insert
     decoder = kind.get(name, SampleRequest if "Sample" in name else FetchRequest)
     hashes = f"{SPEC.schema_hash.hex()}, expected {OTHER.schema_hash.hex()}"
     with pytest.raises(WireError, match=hashes):
