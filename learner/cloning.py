@@ -146,7 +146,9 @@ class CloningLearner:
             updates=self.updates,
             window=self.config.average_updates,
         )
-        return CloningResult(loss=float(loss.detach()), gradient_norm=gradient_norm)
+        return CloningResult(
+            loss=float(loss.detach()), gradient_norm=float(gradient_norm)
+        )
 
     @torch.no_grad()
     def log_likelihood(self, batch: CloningBatch) -> Float[np.ndarray, " batch"]:

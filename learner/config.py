@@ -56,6 +56,10 @@ class LearnerConfig:
     """Batches that one reply of the replay brings: a query's cost is shared by them,
     and their priorities are older by as many updates."""
 
+    grouped: Literal["auto", "always", "never"] = "auto"
+    """Whether the batches of one reply are learnt from in one call, on CUDA as one
+    graph: auto does so on CUDA alone. The loss is then the plain one."""
+
     publish_period: int = 50
     """Updates between two publications of the weights to the actors."""
 

@@ -18,11 +18,13 @@ actors (`actors.windows`), with the return of the n steps and the discount of al
 the last: nothing here depends on n but that the reward is clipped after the sum, as
 Acme does. Nothing in an update is random, so
 network, target, optimiser and the counter are the whole state.
+
+Several updates can go in one call (`learner.groups`), on CUDA as one graph.
 """
 
 import functools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, Protocol, final, runtime_checkable
 
 import numpy as np
@@ -32,16 +34,20 @@ from torch import Tensor, nn
 
 from actors.network import Layout, NetworkConfig, parameter_layout
 from learner.config import LearnerConfig
+from learner.groups import Inputs, Outcome, UpdateGroup, in_groups
 from learner.losses import LossFunction, QBatch, TorchrlLosses, plain_losses
-from learner.network import QNetwork, follow_average, to_torch, to_vector
+from learner.network import QNetwork, to_torch, to_vector
 from learner.targets import importance_weights, weighted_mean
 from learner.training import (
     compute_device,
+    flatten,
     in_precision,
+    keep_memory,
     make_adam,
     restore_training,
     step_down,
     training_state,
+    vector_of,
 )
 from sim.observation import Observation, ObservationSizes
 
@@ -79,8 +85,12 @@ class Learner:
         sizes: ObservationSizes,
         actions: int,
     ) -> None:
-        """Draws the first weights from the seed. Sets torch's thread count."""
+        """Draws the first weights from the seed.
+
+        Sets torch's thread count, and the process to keep its memory.
+        """
         torch.set_num_threads(config.torch_threads)
+        keep_memory()
         self.config = config
         self.network_config = network
         self.sizes = sizes
@@ -94,13 +104,18 @@ class Learner:
         self.network = build().to(self._device)
         self.target = build().to(self._device).requires_grad_(False)
         self.average = build().to(self._device).requires_grad_(False)
-        self._copy_target()
+        self._target_vector = flatten(self.target)
+        self._average_vector = flatten(self.average)
         self.optimiser = make_adam(
             self.network,
             learning_rate=config.learning_rate,
             epsilon=config.adam_epsilon,
         )
-        self._losses = _loss_function(config, actions)
+        self._follow_target(1.0)
+        self._group = self._make_group() if in_groups(config, self._device) else None
+        # What torchrl's loss does cannot all be captured.
+        plain = config.loss == "plain" or self._group is not None
+        self._losses = _loss_function(config, actions, plain=plain)
 
     @property
     def mixture(self) -> int:
@@ -121,36 +136,47 @@ class Learner:
         averaged = self.config.average_updates > 0
         return to_vector(self.average if averaged else self.network)
 
+    @property
+    def group(self) -> int:
+        """Updates that are made in one call: `update`'s 1, or `update_group`'s."""
+        return 1 if self._group is None else self.config.batches_per_reply
+
     def update(self, batch: Batch) -> UpdateResult:
         """One step of Adam on the batch; the target follows when it is due."""
-        q_batch = self._q_batch(batch)
-        losses = self._losses(q_batch)
-        probabilities = self._tensor(batch.probabilities)
-        weights = importance_weights(probabilities, self.config.importance_exponent)
-        loss = weighted_mean(losses.loss, weights)
-        gradient_norm = step_down(
-            loss,
-            network=self.network,
-            optimiser=self.optimiser,
-            limit=self.config.max_gradient_norm,
-        )
+        outcome = self._descend(self._inputs(batch))
         self.updates += 1
-        follow_average(
-            self.average,
-            self.network,
-            updates=self.updates,
-            window=self.config.average_updates,
-        )
+        self._follow_average(self._share(self.updates))
         if self.updates % self.config.target_period == 0:
-            self._copy_target()
-        q_tm1 = q_batch.q_tm1.detach()
-        return UpdateResult(
-            loss=float(loss.detach()),
-            priorities=losses.priority.cpu().numpy(),
-            mean_q=float(q_tm1.gather(-1, q_batch.a_tm1[:, None]).mean()),
-            max_q=float(q_tm1.amax(dim=-1).mean()),
-            gradient_norm=gradient_norm,
+            self._follow_target(1.0)
+        return _results([outcome])[0]
+
+    def update_group(self, batches: Sequence[Batch]) -> list[UpdateResult]:
+        """The same for several batches, one after another, in one call."""
+        if self._group is None or len(batches) != self.group:
+            raise ValueError(f"{len(batches)} batches for a call of {self.group}")
+        every = range(self.updates + 1, self.updates + 1 + self.group)
+        period = self.config.target_period
+        outcomes = self._group.run(
+            [self._inputs(batch) for batch in batches],
+            shares=[self._share(update) for update in every],
+            due=[float(update % period == 0) for update in every],
         )
+        self.updates += self.group
+        return _results(outcomes)
+
+    def _share(self, update: int) -> float:
+        """By how much the average moves towards the network: at first a plain mean."""
+        return 1.0 / max(1, min(update, self.config.average_updates))
+
+    @torch.no_grad()
+    def _follow_average(self, share: float | Tensor) -> None:
+        if self.config.average_updates:
+            self._average_vector.lerp_(vector_of(self.optimiser), share)
+
+    @torch.no_grad()
+    def _follow_target(self, share: float | Tensor) -> None:
+        """1: the target becomes the network, to the bit; 0: nothing."""
+        self._target_vector.lerp_(vector_of(self.optimiser), share)
 
     def state(self) -> dict[str, object]:
         """The whole state, of types that `torch.load(weights_only=True)` reads."""
@@ -163,6 +189,14 @@ class Learner:
         """
         self.updates = restore_training(state, self._modules(), self.optimiser)
 
+    def _make_group(self) -> UpdateGroup:
+        return UpdateGroup(
+            descend=self._descend,
+            follow_average=self._follow_average,
+            follow_target=self._follow_target,
+            graph=self._device.type == "cuda",
+        )
+
     def _modules(self) -> dict[str, nn.Module]:
         return {
             "network": self.network,
@@ -170,22 +204,49 @@ class Learner:
             "average": self.average,
         }
 
-    def _q_batch(self, batch: Batch) -> QBatch:
-        tm1 = to_torch(batch.observation_tm1, self._device)
-        t = to_torch(batch.observation_t, self._device)
+    def _inputs(self, batch: Batch) -> Inputs:
+        return Inputs(
+            tm1=to_torch(batch.observation_tm1, self._device),
+            a_tm1=self._tensor(batch.a_tm1).long(),
+            r_t=self._tensor(batch.r_t),
+            discount_t=self._tensor(batch.discount_t),
+            t=to_torch(batch.observation_t, self._device),
+            probabilities=self._tensor(batch.probabilities),
+        )
+
+    def _descend(self, inputs: Inputs) -> Outcome:
+        """The update but for target and average; nothing waits for the device."""
+        q_batch = self._q_batch(inputs)
+        losses = self._losses(q_batch)
+        weights = importance_weights(
+            inputs.probabilities, self.config.importance_exponent
+        )
+        loss = weighted_mean(losses.loss, weights)
+        norm = step_down(
+            loss,
+            network=self.network,
+            optimiser=self.optimiser,
+            limit=self.config.max_gradient_norm,
+        )
+        q_tm1 = q_batch.q_tm1.detach()
+        taken = q_tm1.gather(-1, inputs.a_tm1[:, None])
+        told = [loss.detach(), taken.mean(), q_tm1.amax(dim=-1).mean(), norm]
+        return Outcome(torch.stack(told), losses.priority)
+
+    def _q_batch(self, inputs: Inputs) -> QBatch:
         # Two passes, though one of twice the batch would start fewer kernels: its
         # backward runs over both halves and made an update 35% slower.
         with in_precision(self.config.precision, self._device):
-            q_tm1 = self.network(*tm1)
+            q_tm1 = self.network(*inputs.tm1)
             with torch.no_grad():
-                q_online_t = self.network(*t)
-                q_target_t = self.target(*t)
+                q_online_t = self.network(*inputs.t)
+                q_target_t = self.target(*inputs.t)
         clip = self.config.reward_clip
         return QBatch(
             q_tm1=q_tm1.float(),
-            a_tm1=self._tensor(batch.a_tm1).long(),
-            r_t=self._tensor(batch.r_t).clamp(-clip, clip),
-            discount_t=self._tensor(batch.discount_t) * self.config.discount,
+            a_tm1=inputs.a_tm1,
+            r_t=inputs.r_t.clamp(-clip, clip),
+            discount_t=inputs.discount_t * self.config.discount,
             q_online_t=q_online_t.float(),
             q_target_t=q_target_t.float(),
         )
@@ -194,12 +255,6 @@ class Learner:
         """On the device; float64 (the replay's probabilities) becomes float32."""
         tensor = torch.from_numpy(np.ascontiguousarray(values)).to(self._device)
         return tensor.float() if tensor.is_floating_point() else tensor
-
-    @torch.no_grad()
-    def _copy_target(self) -> None:
-        torch._foreach_copy_(
-            list(self.target.parameters()), list(self.network.parameters())
-        )
 
 
 @runtime_checkable
@@ -220,7 +275,7 @@ class Drawn(Protocol):
 
 
 class LearnStep(NamedTuple):
-    """One turn of the loop: the update, and where its time went."""
+    """One update, and where its time went: of several in one call, an equal part."""
 
     result: UpdateResult
     waited_s: float  # for the replay
@@ -248,6 +303,8 @@ def learn(
             called once before the first update, then every `publish_period`.
     """
     publish(learner.updates, learner.vector())
+    draws: list[Drawn] = []
+    waited_s = 0.0
     while True:
         start = time.perf_counter()
         drawn = sample()
@@ -255,19 +312,32 @@ def learn(
         if drawn is None:
             yield None
             continue
-        batch = _render(drawn, render)
+        draws.append(drawn)
+        waited_s += sampled - start
+        if len(draws) < learner.group:
+            continue
+        batches = [_render(drawn, render) for drawn in draws]
         rendered = time.perf_counter()
-        result = learner.update(batch)
-        update_priorities(drawn.ids, result.priorities)
+        results = _update(learner, batches)
+        for drawn, result in zip(draws, results, strict=True):
+            update_priorities(drawn.ids, result.priorities)
         updated = time.perf_counter()
-        if learner.updates % learner.config.publish_period == 0:
+        if learner.updates % learner.config.publish_period < len(draws):
             publish(learner.updates, learner.vector())
-        yield LearnStep(
-            result=result,
-            waited_s=sampled - start,
-            rendered_s=rendered - sampled,
-            updated_s=updated - rendered,
-        )
+        for result in results:
+            yield LearnStep(
+                result=result,
+                waited_s=waited_s / len(draws),
+                rendered_s=(rendered - sampled) / len(draws),
+                updated_s=(updated - rendered) / len(draws),
+            )
+        draws, waited_s = [], 0.0
+
+
+def _update(learner: Learner, batches: Sequence[Batch]) -> list[UpdateResult]:
+    if learner.group > 1:
+        return learner.update_group(batches)
+    return [learner.update(batch) for batch in batches]
 
 
 def _render(
@@ -284,7 +354,25 @@ def _render(
     )
 
 
-def _loss_function(config: LearnerConfig, actions: int) -> LossFunction:
-    if config.loss == "plain":
+def _loss_function(config: LearnerConfig, actions: int, *, plain: bool) -> LossFunction:
+    if plain:
         return functools.partial(plain_losses, threshold=config.huber_threshold)
     return TorchrlLosses(actions=actions, threshold=config.huber_threshold)
+
+
+def _results(outcomes: Sequence[Outcome]) -> list[UpdateResult]:
+    """What the device computed, in two transfers for all of them."""
+    told = torch.stack([outcome.told for outcome in outcomes]).tolist()
+    priorities = torch.stack([outcome.priorities for outcome in outcomes])
+    return [
+        UpdateResult(
+            loss=loss,
+            priorities=values,
+            mean_q=mean_q,
+            max_q=max_q,
+            gradient_norm=norm,
+        )
+        for (loss, mean_q, max_q, norm), values in zip(
+            told, priorities.cpu().numpy(), strict=True
+        )
+    ]

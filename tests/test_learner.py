@@ -1,16 +1,19 @@
 """The learner learns, copies its target on time, and repeats itself exactly."""
 
 import itertools
+import resource
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import torch
 
 from actors.network import NetworkConfig
+from learner.groups import in_groups
 from learner.learner import Batch, Learner, LearnerConfig, UpdateResult, learn
-from learner.network import to_vector
-from learner.training import compute_device
+from learner.network import shared_tensor, to_vector
+from learner.training import compute_device, keep_memory
 from sim.observation import Observation, ObservationSizes
 
 SIZES = ObservationSizes(
@@ -260,3 +263,106 @@ def test_auto_is_the_device_at_hand_and_a_missing_one_is_refused(monkeypatch):
     assert compute_device("auto") == torch.device("cpu")
     with pytest.raises(ValueError, match="give cpu or auto"):
         compute_device("cuda")
+
+
+def results_of(learner, updates):
+    """By whichever way the learner makes them: losses and priorities."""
+    batches = list(itertools.islice(make_batches(), updates))
+    if learner.group == 1:
+        return [learner.update(batch) for batch in batches]
+    count = learner.group
+    groups = [batches[at : at + count] for at in range(0, updates, count)]
+    return [result for group in groups for result in learner.update_group(group)]
+
+
+def test_several_updates_in_one_call_are_the_same_updates():
+    """The target is due within a call, and the average's share changes in it."""
+    fields = {"average_updates": 5, "target_period": 5, "max_gradient_norm": 0.5}
+    single = make_learner(**fields)
+    grouped = make_learner(**fields, grouped="always", batches_per_reply=3)
+    assert (single.group, grouped.group) == (1, 3)
+    ours, theirs = results_of(grouped, 12), results_of(single, 12)
+    assert grouped.updates == 12
+    for mine, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(mine.priorities, other.priorities, rtol=1e-5)
+        np.testing.assert_allclose(mine[:1] + mine[2:], other[:1] + other[2:], 1e-5)
+    np.testing.assert_allclose(grouped.vector(), single.vector(), atol=1e-6)
+    target = to_vector(grouped.target)
+    np.testing.assert_allclose(target, to_vector(single.target), atol=1e-6)
+    assert np.abs(target - grouped.vector()).max() > 1e-5
+    average = grouped.policy_vector()
+    np.testing.assert_allclose(average, single.policy_vector(), atol=1e-6)
+    with pytest.raises(ValueError, match="2 batches for a call of 3"):
+        grouped.update_group(list(itertools.islice(make_batches(), 2)))
+
+
+def test_groups_are_for_cuda_unless_asked_for():
+    cpu, cuda = torch.device("cpu"), torch.device("cuda")
+    assert not in_groups(LearnerConfig(), cpu)
+    assert in_groups(LearnerConfig(), cuda)
+    assert in_groups(LearnerConfig(grouped="always"), cpu)
+    assert not in_groups(LearnerConfig(grouped="never"), cuda)
+    assert not in_groups(LearnerConfig(batches_per_reply=1), cuda)
+
+
+def test_the_loop_makes_the_updates_of_a_call_together():
+    rows = np.zeros(8, ROW)
+    draws = [Draw(np.full(8, i, np.uint64), np.full(8, 0.1), rows) for i in range(6)]
+    source = iter([draws[0], None, *draws[1:]])
+    rng = np.random.default_rng(0)
+    updated, published = [], []
+    steps = learn(
+        learner=make_learner(grouped="always", batches_per_reply=3, publish_period=2),
+        sample=lambda: next(source),
+        update_priorities=lambda ids, values: updated.append(int(ids[0])),
+        render=lambda rows: (make_observations(8, rng), make_observations(8, rng)),
+        publish=lambda version, vector: published.append(version),
+    )
+    assert next(steps) is None
+    turns = list(itertools.islice(steps, 3))
+    assert updated == [0, 1, 2]
+    assert len({turn.result.loss for turn in turns}) == 3
+    assert turns[0].updated_s == turns[2].updated_s > 0
+    list(itertools.islice(steps, 3))
+    assert updated == [0, 1, 2, 3, 4, 5]
+    assert published == [0, 3, 6]
+
+
+def test_what_is_saved_is_by_layer():
+    """So that an optimiser's state does not depend on how parameters are laid out."""
+    learner = make_learner()
+    learner.update(next(make_batches()))
+    state = learner.state()
+    layers = dict(learner.network.named_parameters())
+    moments = state["optimiser"]["state"]
+    assert [m["exp_avg"].shape for m in moments.values()] == [
+        layer.shape for layer in layers.values()
+    ]
+    other = make_learner(seed=1)
+    other.restore(state)
+    batches = list(itertools.islice(make_batches(1), 3))
+    expected = [learner.update(batch).loss for batch in batches]
+    assert [other.update(batch).loss for batch in batches] == expected
+
+
+def test_a_rendered_array_becomes_a_tensor_without_a_copy():
+    for field in (jnp.ones((4, 3)), jnp.ones((4, 3), bool)):
+        for host in (True, False):
+            tensor = shared_tensor(field, host=host)
+            assert tensor.data_ptr() == field.unsafe_buffer_pointer()
+            assert tensor.shape == (4, 3)
+            assert bool((tensor == 1).all())
+
+
+def test_freed_memory_is_kept():
+    """A large tensor that is made anew lies in pages that are there already."""
+    if not keep_memory():
+        pytest.skip("no glibc here")
+    values, times = 1 << 21, 8
+    for _ in range(2):
+        torch.ones(values)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(times):
+        torch.ones(values)
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+    assert faults < times * values * 4 / resource.getpagesize() / 2

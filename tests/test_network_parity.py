@@ -132,11 +132,13 @@ def test_tokens_are_a_set():
     )
 
 
-def test_cross_attention_is_multi_head_attention():
+@pytest.mark.parametrize("count", [8, 9])  # folded into the queries; formed
+@pytest.mark.parametrize("gradients", [True, False])
+def test_cross_attention_is_multi_head_attention(count, gradients):
     """Oracle: the textbook order, with keys and values of every token."""
     config = CONFIGS["deep"]
-    block = make_network(config).cross[0]
-    latents, tokens = torch.randn(3, 8, 48), torch.randn(3, 14, 48)
+    block = make_network(config).cross[0].requires_grad_(gradients)
+    latents, tokens = torch.randn(3, count, 48), torch.randn(3, 14, 48)
     valid = torch.rand(3, 1, 14) < 0.6
     valid[:, :, 0] = True
     query = block.query(block.query_norm(latents))
@@ -147,11 +149,15 @@ def test_cross_attention_is_multi_head_attention():
     y = torch.nn.functional.scaled_dot_product_attention(
         q, k, v, attn_mask=valid[:, None]
     )
-    y = latents + block.out(y.transpose(1, 2).reshape(3, 8, 48))
+    y = latents + block.out(y.transpose(1, 2).reshape(3, count, 48))
     hidden = block.expand(block.feedforward_norm(y))
     expected = y + block.contract(torch.nn.functional.gelu(hidden, approximate="tanh"))
-    actual = block(latents, tokens, torch.where(valid, 0.0, -1e9))
+    bias = torch.where(valid, 0.0, -1e9)
+    with torch.set_grad_enabled(gradients):
+        actual = block(latents, tokens, bias)
+        pooled = block(latents, tokens, bias, pooled=True)
     torch.testing.assert_close(actual, expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(pooled, expected.mean(1), rtol=0, atol=1e-5)
 
 
 def test_gradients_reach_every_parameter():
