@@ -102,7 +102,14 @@ def quick() -> ExperimentConfig:
     """A run of minutes on two cores."""
     return ExperimentConfig(
         environment=EnvironmentConfig(
-            action=ActionConfig(acceleration_bins=5, curvature=0.15, curvature_bins=7),
+            action=ActionConfig(
+                acceleration_bins=5,
+                curvature=0.15,
+                curvature_bins=7,
+                sideways_bins=1,
+                turn=0.1,
+                turn_bins=9,
+            ),
             observation=ObservationConfig(neighbours=8, road_rows=32, lights=2),
             progress=0.03,
             terminate=True,

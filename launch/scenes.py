@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,6 +112,38 @@ def prepare_banks(
         gathered.write(held_out, theirs)
     _tell_left_out(gathered.tally)
     return open_bank(train), open_bank(held_out)
+
+
+def prepare_rotation(
+    every: Path, turn: Callable[[int], tuple[Path, Path]], *, sources: Sequence[str]
+) -> int:
+    """A bank of all recorded scenes, and two for each; how many scenes there are.
+
+    `turn` names the two: all others to train on, and the one that is held out.
+    """
+    if every.exists():  # written last
+        return open_bank(every).scenes
+    paths = [Path(source) for source in sources]
+    made = [str(path) for path in paths if path.is_file() and is_bank(path)]
+    if made or PROCEDURAL in sources:
+        raise LaunchError(
+            f"--rotate: {[*made, PROCEDURAL][0]} is not taken; name files or folders "
+            "of recorded scenes"
+        )
+    every.parent.mkdir(exist_ok=True)
+    with gathering(work_folder(every), keep=False) as gathered:
+        gathered.gather(_recorded(paths), _conversion(work_folder(every), _Options()))
+        parts = gathered.parts
+        if len(parts) < 2:
+            raise LaunchError("--rotate: of one scene none is left to train on")
+        for number, part in enumerate(parts):
+            train, held_out = turn(number)
+            train.parent.mkdir(exist_ok=True)
+            gathered.write(train, [*parts[:number], *parts[number + 1 :]])
+            gathered.write(held_out, [part])
+        gathered.write(every, parts)
+    _tell_left_out(gathered.tally)
+    return len(parts)
 
 
 def _tell_left_out(tally: Tally) -> None:

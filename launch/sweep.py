@@ -2,9 +2,14 @@
 
     RUN/sweep.json           what is swept                   sweep.db   the ledger
         scenes/*.bank        the scenes of all runs          logs/*.log
+        scenes/without-N/    with `rotate`: of the turns
         trials/NAME/         a run as `slipstream train` makes it
         baselines.json       the benchmark's agents on the held-out scenes
         table.md, .json      the table                       curves.png
+
+With `rotate` each recorded scene is held out in turn and every point is trained once on
+all others; its figures are those of all turns together. No checkpoint is chosen there:
+the scene that is held out would choose it.
 
 The grid is the paper's (appendix A.2, the agents of its Table 3): behaviour cloning at
 three learning rates in four action spaces, double DQN in the two discrete ones. What
@@ -19,21 +24,25 @@ user's (exit code 2), which all would share, ends the sweep.
 import asyncio
 import contextlib
 import json
+import shlex
 import shutil
 import signal
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, final
 
+from launch.budget import ScenesConfig
 from launch.config import CLONING_PRESETS, PRESETS, write_atomically
 from launch.converting import say
 from launch.errors import INTERRUPTED, USER_ERROR, LaunchError
 from launch.supervisor import die_with_parent, signal_group
 from launch.sweep_ledger import Ledger, Point, lock
-from launch.sweep_table import baselines_of, read_trained, write_table
+from launch.sweep_results import read_evaluation
+from launch.sweep_scenes import banks_of, make_rotation, make_scenes
+from launch.sweep_table import baselines_of, write_table
 
 SWEEP: Final = "sweep.json"
 TRIALS: Final = "trials"
@@ -68,6 +77,8 @@ class SweepConfig:
     """Procedural scenes to train on; 0 is the preset's number."""
     held_out_scenes: int = 0
     """Procedural scenes to evaluate on; 0 is the preset's number."""
+    rotate: bool = False
+    """Holds out each of the recorded scenes in turn, and trains on all others."""
     jobs: int = 1
     """Runs at a time; each has several processes."""
 
@@ -78,14 +89,32 @@ def sweep_command(grid: str, options: SweepConfig, passed_on: Sequence[str]) -> 
     folder = options.run
     _settle(folder, grid, options, passed_on)
     with lock(folder):
-        _make_scenes(folder, grid, options)
+        if options.rotate:
+            scenes = range(make_rotation(folder, options.scenes))
+            points = [replace(point, held_out=n) for point in points for n in scenes]
+        else:
+            make_scenes(folder, options.scenes, _scenes_of(grid, options))
         return run_sweep(
             folder=folder,
             points=points,
             options=options,
             passed_on=tuple(passed_on),
             launch=LAUNCH,
+            command=command_of(grid, options, passed_on),
         )
+
+
+def command_of(grid: str, options: SweepConfig, passed_on: Sequence[str]) -> str:
+    """The command of a sweep, its settings in the order of their definition."""
+    words = ["slipstream", "sweep", grid]
+    for field in fields(options):
+        value = getattr(options, field.name)
+        if value == field.default:
+            continue
+        words.append(f"--{field.name.replace('_', '-')}")
+        if value is not True:
+            words += map(str, value if isinstance(value, tuple) else [value])
+    return shlex.join([*words, *(["--", *passed_on] if passed_on else [])])
 
 
 def points_of(grid: str, options: SweepConfig) -> list[Point]:
@@ -115,6 +144,17 @@ def points_of(grid: str, options: SweepConfig) -> list[Point]:
         if space in (options.spaces or every)
         for rate in (rates if algorithm == "bc" else (0.0,))
     ]
+
+
+def _scenes_of(grid: str, options: SweepConfig) -> ScenesConfig:
+    """How many procedural scenes; the same for both algorithms."""
+    preset = (CLONING_PRESETS if "bc" in GRIDS[grid] else PRESETS)[options.preset]
+    config = preset().scenes
+    return replace(
+        config,
+        train=options.train_scenes or config.train,
+        held_out=options.held_out_scenes or config.held_out,
+    )
 
 
 def _settle(
@@ -152,31 +192,6 @@ def _settle(
     write_atomically(path, (json.dumps(wanted, indent=1) + "\n").encode())
 
 
-def banks_of(folder: Path) -> tuple[Path, Path]:
-    """Where the scenes of all runs are."""
-    return folder / "scenes" / "train.bank", folder / "scenes" / "heldout.bank"
-
-
-def _make_scenes(folder: Path, grid: str, options: SweepConfig) -> None:
-    """Both banks, once for all runs."""
-    from dataclasses import replace
-
-    from launch.scenes import prepare_banks
-
-    train, held_out = banks_of(folder)
-    if train.exists() and held_out.exists():
-        return  # a bank has its name only when it is whole
-    train.parent.mkdir(exist_ok=True)
-    preset = (CLONING_PRESETS if "bc" in GRIDS[grid] else PRESETS)[options.preset]
-    config = preset().scenes
-    config = replace(
-        config,
-        train=options.train_scenes or config.train,
-        held_out=options.held_out_scenes or config.held_out,
-    )
-    prepare_banks(train, held_out, sources=options.scenes, config=config)
-
-
 def run_sweep(
     *,
     folder: Path,
@@ -184,8 +199,12 @@ def run_sweep(
     options: SweepConfig,
     passed_on: tuple[str, ...],
     launch: tuple[str, ...],
+    command: str,
 ) -> int:
-    """Runs what is left of the grid, then makes the table; the exit code."""
+    """Runs what is left of the grid, then makes the table; the exit code.
+
+    `command` is what the user typed, for the table.
+    """
     sweep = Sweep(
         folder=folder,
         points=points,
@@ -196,7 +215,13 @@ def run_sweep(
     if not asyncio.run(sweep.run()):
         say(f"interrupted; the same command goes on with {folder}")
         return INTERRUPTED
-    write_table(folder, points, sweep.folders, baselines_of(folder / BASELINES))
+    write_table(
+        folder,
+        points,
+        sweep.folders,
+        baselines_of(folder / BASELINES),
+        command,
+    )
     return 0
 
 
@@ -257,15 +282,16 @@ class Sweep:
     async def _run_point(self, index: int) -> None:
         point, folder = self._points[index], self.folders[index]
         began = time.monotonic()
-        trained = read_trained(folder)
-        if trained is None:
+        found = read_evaluation(folder)
+        if found is None:
             say(f"{point.name}: begins ({len(self._ledger.complete)} are complete)")
             code = await self._call(self._training(point, folder), point.name)
-            trained = read_trained(folder) if code == 0 else None
+            found = read_evaluation(folder) if code == 0 else None
             if code == USER_ERROR:
                 raise LaunchError(f"{point.name}: {self._last_line(point.name)}")
-            if trained is None:
+            if found is None:
                 return self._failed(index, f"exit code {code}")
+        trained = found["trained"]
         self._ledger.finish(index, float(trained["failure_rate"]))
         say(
             f"{point.name}: failures {trained['failure_rate']:.1%}, log ADE "
@@ -283,7 +309,7 @@ class Sweep:
 
     def _training(self, point: Point, folder: Path) -> list[str]:
         """The command of a point's run; it goes on where there is a checkpoint."""
-        train, held_out = banks_of(self._folder)
+        train, held_out = banks_of(self._folder, point.held_out)
         words = ["train", point.algorithm, "--preset", self._options.preset]
         if point.algorithm == "bc":
             words += ["--space", point.space]
@@ -292,6 +318,8 @@ class Sweep:
             name = point.space.removesuffix("-discrete").upper()
             words += ["--environment.action.space", name]
         words += ["--scenes", str(train), str(held_out), "--run", str(folder)]
+        if point.held_out >= 0:
+            words += ["--evaluator.scenes", "0"]
         words += ["--seed", str(self._options.seed), *self._passed_on]
         if (folder / "config.json").exists():
             words.append("--resume")

@@ -44,12 +44,14 @@ class Point:
     algorithm: str  # bc or dqn
     space: str
     learning_rate: float  # 0: the preset's
+    held_out: int = -1  # the scene that is, where each is in turn; -1: a bank of them
 
     @property
     def name(self) -> str:
         """Names its folder."""
         rate = f"-{self.learning_rate:g}" if self.learning_rate else ""
-        return f"{self.algorithm}-{self.space}{rate}"
+        turn = f"-without-{self.held_out}" if self.held_out >= 0 else ""
+        return f"{self.algorithm}-{self.space}{rate}{turn}"
 
 
 @contextmanager
@@ -142,4 +144,5 @@ def _params(point: Point) -> dict[str, str | float]:
         "algorithm": point.algorithm,
         "space": point.space,
         "learning_rate": point.learning_rate,
+        "held_out": point.held_out,
     }

@@ -4,7 +4,8 @@ Agents are rows: the benchmark's, then for every action space the best of its ru
 failure rate and then log displacement (the order by which a run keeps its best
 checkpoint). Columns are the benchmark's metrics with 95% intervals over the held-out
 scenes. Learning rate and checkpoint are chosen by these very scenes: the more of both
-there are, the more that flatters. A second table has every run.
+there are, the more that flatters. A second table has every run: how long it was trained
+and its failures on the scenes that did not choose its checkpoint.
 """
 
 import csv
@@ -16,8 +17,8 @@ from typing import Any, Final, Literal
 from rich.table import Table
 
 from launch.config import write_atomically
-from launch.errors import LaunchError
 from launch.sweep_ledger import Point
+from launch.sweep_results import Finished, Summary, read_finished, results_of
 from launch.tables import WIDE, printer
 
 METRICS: Final = (
@@ -45,6 +46,7 @@ _AGENTS: Final = {
     "constant-speed": ("Constant speed", ""),
     "random": ("Random", ""),
 }
+EVALUATIONS: Final = "evaluation.csv"
 _NAMES: Final = {"bc": "BC", "dqn": "DQN"}
 CURVES: Final = (
     ("failure_rate", "failure rate, held out"),
@@ -53,21 +55,6 @@ CURVES: Final = (
 )
 _COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _STYLES: Final = ("-", "--", ":", "-.")
-Summary = Mapping[str, Any]
-
-
-def read_trained(run: Path) -> Summary | None:
-    """The trained agent's figures of a finished run; None: it has not finished."""
-    path = run / "evaluation.json"
-    try:
-        agents = json.loads(path.read_text())["agents"]
-        return next(agent for agent in agents if agent["agent"] == "trained")
-    except FileNotFoundError:
-        return None
-    except (ValueError, KeyError, TypeError, StopIteration) as error:
-        raise LaunchError(
-            f"{path}: not a run's evaluation; remove it, and the run is evaluated again"
-        ) from error
 
 
 def baselines_of(path: Path) -> list[Summary]:
@@ -123,6 +110,19 @@ def _of(summary: Summary) -> dict[str, Any]:
     }
 
 
+def _run(one: Finished) -> dict[str, Any]:
+    """A run's row of the second table."""
+    others = one.others
+    return {
+        **_row(one.point, one.trained),
+        "run": one.point.name,
+        "updates": one.updates,
+        "minutes": round(one.minutes, 1),
+        "scenes_held_out": [scene.id for scene in one.scenes],
+        "on_others": _of(others) if others else None,
+    }
+
+
 def _cell(row: Mapping[str, Any], name: str, form: str) -> str:
     if row[name] is None:
         return "-"
@@ -155,36 +155,59 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def markdown_of_runs(runs: Sequence[Mapping[str, Any]]) -> str:
+    """The second table."""
+    heads = ["run", "updates", "minutes", "failures", "log ADE [m]"]
+    heads += ["scenes that did not choose", "failures on them"]
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    for row in runs:
+        others = row["on_others"]
+        words = [row["run"], f"{row['updates']:,}", f"{row['minutes']:.1f}"]
+        words.append(_cell(row, "failure_rate", "{:.1%}"))
+        words.append(_cell(row, "log_displacement", "{:.2f}"))
+        words.append(str(others["scenes"]) if others else "-")
+        words.append(_cell(others, "failure_rate", "{:.1%}") if others else "-")
+        lines.append("| " + " | ".join(words) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def write_table(
     folder: Path,
     points: Sequence[Point],
     runs: Sequence[Path],
     baselines: Sequence[Summary],
+    command: str,
 ) -> None:
     """Writes table.md, table.json and curves.png, and prints the table."""
-    results = {
-        point: found
+    finished = [
+        found
         for point, run in zip(points, runs, strict=True)
-        if (found := read_trained(run)) is not None
-    }
-    missing = [point.name for point in points if point not in results]
-    rows = rows_of(results, baselines)
-    every = [_row(point, results[point]) for point in results]
-    content = {"table": rows, "runs": every, "failed": missing}
+        if (found := read_finished(point, run)) is not None
+    ]
+    ended = {one.point for one in finished}
+    missing = [point.name for point in points if point not in ended]
+    rows = rows_of(results_of(points, finished), baselines)
+    every = [_run(one) for one in finished]
+    content = {"command": command, "table": rows, "runs": every, "failed": missing}
     text = json.dumps(content, indent=1) + "\n"
     write_atomically(folder / "table.json", text.encode())
+    in_turn = ", each held out in turn" if points[0].held_out >= 0 else " held out"
     parts = [
-        f"# {rows[0]['scenes']} held-out scenes, 95% intervals over them in brackets\n",
+        f"# {rows[0]['scenes']} scenes{in_turn}\n",
+        f"    {command}\n",
+        "95% intervals over the scenes in brackets.\n",
         markdown(rows),
         "## Every run\n",
-        markdown(every),
+        markdown_of_runs(every),
     ]
     if missing:
         parts.append(f"Failed: {', '.join(missing)}; the reasons are in logs/.\n")
     write_atomically(folder / "table.md", "\n".join(parts).encode())
-    plot_curves(folder / "curves.png", points, runs)
+    told = f"table: {folder / 'table.md'}"
+    if plot_curves(folder / "curves.png", points, runs):
+        told += f"  curves: {folder / 'curves.png'}"
     _print(rows, missing)
-    print(f"table: {folder / 'table.md'}  curves: {folder / 'curves.png'}")
+    print(told)
 
 
 def _print(rows: Sequence[Mapping[str, Any]], missing: Sequence[str]) -> None:
@@ -207,8 +230,10 @@ def _print(rows: Sequence[Mapping[str, Any]], missing: Sequence[str]) -> None:
         console.print(f"failed: {', '.join(missing)}")
 
 
-def plot_curves(path: Path, points: Sequence[Point], runs: Sequence[Path]) -> None:
-    """Draws how the runs' checkpoints drove, over the updates."""
+def plot_curves(path: Path, points: Sequence[Point], runs: Sequence[Path]) -> bool:
+    """Draws how the runs' checkpoints drove; False where none was judged."""
+    if not any((run / EVALUATIONS).exists() for run in runs):
+        return False
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -220,7 +245,7 @@ def plot_curves(path: Path, points: Sequence[Point], runs: Sequence[Path]) -> No
     FigureCanvasAgg(figure)
     for down, algorithm in enumerate(algorithms):
         shown = [
-            (point, read_curve(run / "evaluation.csv"))
+            (point, read_curve(run / EVALUATIONS))
             for point, run in zip(points, runs, strict=True)
             if point.algorithm == algorithm
         ]
@@ -250,6 +275,7 @@ def plot_curves(path: Path, points: Sequence[Point], runs: Sequence[Path]) -> No
             if across == 0:
                 axes.legend(fontsize=6)
     figure.savefig(path, dpi=120)
+    return True
 
 
 def read_curve(path: Path) -> dict[str, tuple[list[int], list[float]]]:

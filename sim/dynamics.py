@@ -318,7 +318,8 @@ def nearest_action(
     """The grid's index nearest to a continuous action, each component by its limit."""
     table = action_table(config)
     action = in_own_frame(state, action, config)
-    scale = np.maximum(np.abs(table).max(0), 1e-6)
+    scale = np.abs(table).max(0)
+    scale[scale == 0] = np.inf  # a single bin tells no two actions apart
     difference = (jnp.asarray(table) - action[None]) / jnp.asarray(scale)[None]
     return jnp.argmin((difference**2).sum(-1)).astype(jnp.int32)
 

@@ -300,3 +300,13 @@ def test_stepping_compiles_once() -> None:
     for speed, index in ((1.0, 3), (2.0, 50)):
         step(driving(0, 0, 0, speed), jnp.int32(index))
     assert len(traces) == 1
+
+
+def test_a_single_bin_is_no_distance():
+    """All actions have that component: what it lacks is the same for each."""
+    config = ActionConfig(space=ActionSpace.DELTA, sideways_bins=1)
+    table = dynamics.action_table(config)
+    state = ObjectState(*jnp.zeros(5))
+    for index in (0, 5, len(table) - 1):
+        action = jnp.asarray(table[index] + np.array([0.01, 0.15, 0.001], np.float32))
+        assert int(dynamics.nearest_action(state, action, config)) == index

@@ -12,9 +12,10 @@ import psutil
 import pytest
 
 from launch.main import main
-from launch.sweep import SweepConfig, points_of
+from launch.sweep import SweepConfig, command_of, points_of
 from launch.sweep_ledger import Ledger, Point, lock
-from launch.sweep_table import best_of, read_curve, read_trained, rows_of
+from launch.sweep_results import read_evaluation
+from launch.sweep_table import best_of, read_curve, rows_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PATIENCE_S = 60.0
@@ -53,7 +54,15 @@ if (root / "hang").exists() and (root / "hang").read_text() == run.name:
     time.sleep(600)
 failures = 0.5 if "delta" in run.name else 0.25
 (run / "evaluation.csv").write_text("updates,failure_rate,log_likelihood\\n10,0.5,\\n")
-scores = json.dumps({"agents": [agent("trained", failures)]})
+(run / "curves.csv").write_text("updates,loss,seconds\\n10,1.0,90.0\\n")
+counts = ("objects valid overlap offroad kinematic_infeasibility wrong_way off_route "
+          "failure_objects overlap_objects offroad_objects wrong_way_objects "
+          "off_route_objects").split()
+scene = {"id": run.name, **dict.fromkeys(counts, 1), "failed": True, "progress": 1.0,
+         "log_displacement": 1.0, "progression": 1.0}
+scores = json.dumps({"agents": [agent("trained", failures)],
+                     "scenes": {"trained": [scene]},
+                     "on_others": agent("trained", 0.125)})
 (run / "evaluation.json").write_text(scores)
 """
 DRIVER = """
@@ -66,7 +75,7 @@ options = SweepConfig(run=folder, learning_rates=(1e-4, 3e-4), jobs=jobs)
 with lock(folder):
     sys.exit(run_sweep(folder=folder, points=points_of("all", options), options=options,
                        passed_on=("--budget.minutes", "1"),
-                       launch=(sys.executable, fake)))
+                       launch=(sys.executable, fake), command="slipstream sweep"))
 """
 
 
@@ -153,7 +162,10 @@ def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path) -> None:
     assert [agent for agent, _ in agents[4:]] == [
         *("IDM", "Constant speed", "Random", "BC", "BC", "BC", "BC", "DQN", "DQN")
     ]
-    assert "| BC | Delta | 0.0001 |" in (folder / "table.md").read_text()
+    told_in_file = (folder / "table.md").read_text()
+    assert "| BC | Delta | 0.0001 |" in told_in_file
+    assert "| bc-delta-0.0001 | 10 | 1.5 | 50.0% [0.0, 100.0] |" in told_in_file
+    assert "| 8 | 12.5% [0.0, 100.0] |" in told_in_file  # that did not choose
     assert "Bicycle-Discrete" in told
     assert (folder / "curves.png").stat().st_size > 10_000
 
@@ -247,12 +259,19 @@ def test_the_best_is_by_failures_and_then_displacement() -> None:
     assert rows_of({}, []) == []
 
 
+def test_the_command_is_told_as_it_was_typed() -> None:
+    options = SweepConfig(run=Path("a b"), scenes=("x", "y"), rotate=True, jobs=2)
+    assert command_of("dqn", options, ["--actors", "1"]) == (
+        "slipstream sweep dqn --run 'a b' --scenes x y --rotate --jobs 2 -- --actors 1"
+    )
+
+
 def test_a_damaged_evaluation_is_said_so(tmp_path: Path) -> None:
-    assert read_trained(tmp_path) is None
+    assert read_evaluation(tmp_path) is None
     assert read_curve(tmp_path / "evaluation.csv") == {}
     (tmp_path / "evaluation.json").write_text("{")
     with pytest.raises(Exception, match="not a run's evaluation"):
-        read_trained(tmp_path)
+        read_evaluation(tmp_path)
 
 
 @pytest.mark.parametrize(
