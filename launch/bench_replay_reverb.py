@@ -17,6 +17,7 @@ import numpy as np
 from launch.bench_replay_lines import Counts, Line, request
 
 TABLE = "replay"
+IN_FLIGHT = 16  # batches: as many as our reader has, by two queries of eight
 
 
 def main() -> None:
@@ -84,7 +85,7 @@ def reader(wanted: dict[str, Any]) -> None:
         table=TABLE,
         dtypes={"x": tensorflow.uint8},
         shapes={"x": tensorflow.TensorShape([load["row_bytes"]])},
-        max_in_flight_samples_per_worker=2 * batch,
+        max_in_flight_samples_per_worker=IN_FLIGHT * batch,
         num_workers_per_iterator=1,
     )
     samples = dataset.batch(batch, drop_remainder=True).prefetch(2)

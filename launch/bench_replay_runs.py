@@ -49,7 +49,7 @@ class Workload:
     capacity: int = 20_000
     exponent: float = 0.6
     durable: bool = False
-    batches_per_reply: int = 4
+    batches_per_reply: int = 8
     in_flight: int = 2
     history: int = 0  # above 0: the project's own rows, of the bank named here
     bank: str = ""

@@ -35,7 +35,7 @@ class Sizes:
     seconds: float = 3.0
     capacity: int = 20_000
     min_size: int = 16_000  # most of a ring is filled before the limiter counts
-    batches_per_reply: int = 4
+    batches_per_reply: int = 8
     scenes: int = 16  # of the bank that rows are rendered from
     memory_rows: tuple[tuple[int, int], ...] = ((8192, 1 << 14), (128, 1 << 19))
     shards: tuple[int, ...] = (1, 2, 3, 4)
