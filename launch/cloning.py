@@ -6,9 +6,6 @@ and without bound (`launch.config.with_filled_replay`). It stays, and fills agai
 replay that was killed and has come back empty. A filler that is started again makes
 its pass from the beginning: rows of the pass before are pushed out, the oldest first,
 and when it ends each row is there once.
-
-    RUN/curves.csv           loss, updates per second, shares of time
-        checkpoints/         the newest
 """
 
 import dataclasses
@@ -16,8 +13,7 @@ import functools
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Final, final
+from typing import Any, Final
 
 import jax
 import numpy as np
@@ -28,11 +24,9 @@ from actors.straying import strayed
 from launch.config import FILL_ROWS, ExperimentConfig, RunFile, row_spec_of
 from launch.errors import LaunchError
 from launch.join import JoinConfig, Joined, joined, train_bank
-from launch.learning import CHECKPOINTS, CURVES, TENSORBOARD, checkpoint_extra, spent
+from launch.progress import Progress, Reporter, resume, spent
 from launch.status import STATUS_S
-from learner.checkpoint import latest_checkpoint, load_checkpoint, save_checkpoint
-from learner.cloning import CloneStep, CloningLearner, clone
-from learner.curves import CurvesWriter
+from learner.cloning import CloningLearner, clone
 from replay.channels import StatusPublisher
 from replay.client import ReplayTimeout, Writer
 from replay.shards_directory import ShardDirectory
@@ -41,13 +35,6 @@ from replay.shards_tools import fetch_all_stats
 from sim.bank import Bank, BankFile
 from sim.observation import Observation, observation_sizes
 
-COLUMNS: Final = (
-    "loss",
-    "updates_per_s",
-    "waited_share",
-    "rendered_share",
-    "seconds",
-)
 _WAIT_S: Final = 0.5  # between two looks at the reasons to stop
 _FLUSH_S: Final = 30.0
 Draw = Callable[[], np.ndarray | None]
@@ -105,125 +92,16 @@ def with_straying(draw: Draw, config: ExperimentConfig, updates: int) -> Draw:
     return drawn
 
 
-def resume_cloning(learner: CloningLearner, folder: Path) -> float:
-    """Restores the run's newest checkpoint, if any; the seconds it had taken."""
-    if latest_checkpoint(folder / CHECKPOINTS) is None:
-        return 0.0
-    meta = load_checkpoint(folder / CHECKPOINTS, learner=learner)
-    return float(meta["extra"]["elapsed_s"])
-
-
-@final
-class CloneReporter:
-    """Status every second, curves every few, a checkpoint now and then."""
-
-    def __init__(
-        self,
-        *,
-        learner: CloningLearner,
-        config: ExperimentConfig,
-        folder: Path,
-        before_s: float,
-        tell: Callable[[dict[str, float | int | str]], object] = lambda told: None,
-        saved: Callable[[], object] = lambda: None,
-    ) -> None:
-        """Opens the curves; `before_s` was spent before this process began.
-
-        `saved` is called after each checkpoint.
-        """
-        report = config.report
-        self._learner = learner
-        self._config = config
-        self._folder = folder
-        self._before_s = before_s
-        self._tell = tell
-        self._saved = saved
-        self._began: float | None = None
-        self._steps: list[CloneStep] = []
-        self._seen: dict[str, float] = {}
-        self._curves = CurvesWriter(
-            csv_path=folder / CURVES,
-            tensorboard=folder / TENSORBOARD if report.tensorboard else None,
-            columns=COLUMNS,
-            resume_from=learner.updates,
-        )
-        now = time.monotonic()
-        self._written = self._status_due = now
-        self._checkpoint_due = now + report.checkpoint_s
-
-    @property
-    def elapsed_s(self) -> float:
-        """Since the first update, over all restarts."""
-        running = 0.0 if self._began is None else time.monotonic() - self._began
-        return self._before_s + running
-
-    def add(self, step: CloneStep) -> None:
-        """Counts one update."""
-        if self._began is None:
-            # Waiting for the replay to fill is no part of the budget, nor compiling.
-            self._began = self._written = time.monotonic()
-            return
-        self._steps.append(step)
-
-    def look(self) -> None:
-        """Writes what is due."""
-        now = time.monotonic()
-        if now >= self._written + self._config.report.curves_s:
-            self.write()
-        if now >= self._status_due:
-            self._status_due = now + STATUS_S
-            self._tell(
-                {
-                    "updates": self._learner.updates,
-                    "elapsed_s": self.elapsed_s,
-                    **self._seen,
-                }
-            )
-        if now >= self._checkpoint_due:
-            self.save()
-            self._checkpoint_due = time.monotonic() + self._config.report.checkpoint_s
-
-    def write(self) -> None:
-        """One row of the averages since the last, where there was an update since."""
-        wall = max(time.monotonic() - self._written, 1e-9)
-        steps, self._steps, self._written = self._steps, [], time.monotonic()
-        if not steps:
-            return
-        self._seen = {
-            "loss": float(np.mean([step.result.loss for step in steps])),
-            "updates_per_s": len(steps) / wall,
-            "waited_share": sum(step.waited_s for step in steps) / wall,
-            "rendered_share": sum(step.rendered_s for step in steps) / wall,
-        }
-        values = self._seen | {"seconds": self.elapsed_s}
-        self._curves.write(self._learner.updates, values)
-
-    def save(self) -> None:
-        """Writes a checkpoint."""
-        save_checkpoint(
-            self._folder / CHECKPOINTS,
-            learner=self._learner,
-            extra=checkpoint_extra(self._config, self.elapsed_s, {}),
-            keep=self._config.report.checkpoints,
-        )
-        self._saved()
-
-    def close(self) -> None:
-        """The last row and checkpoint."""
-        self.write()
-        self.save()
-        self._curves.close()
-
-
 def clone_from_replay(place: Joined, stop: threading.Event) -> None:
     """The learner's role: clones until the budget is spent or it is asked to stop."""
     config = place.run.config
     learner = make_cloner(config)
-    reporter = CloneReporter(
+    progress = Progress(resume(learner, place.folder))
+    reporter = Reporter(
         learner=learner,
         config=config,
         folder=place.folder,
-        before_s=resume_cloning(learner, place.folder),
+        progress=progress,
         tell=StatusPublisher(place.session, place.keys, "learner").put,
     )
     spec = row_spec_of(place.run)
@@ -247,9 +125,9 @@ def clone_from_replay(place: Joined, stop: threading.Event) -> None:
     draw = with_straying(sample, config, learner.updates)
     for step in clone(learner=learner, sample=draw, render=render):
         if step is not None:
-            reporter.add(step)
+            progress.add(step)
         reporter.look()
-        over = spent(config, learner.updates, reporter.elapsed_s)
+        over = spent(config, learner.updates, progress.elapsed_s)
         if over or stop.is_set():
             break
     reporter.close()

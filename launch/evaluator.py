@@ -36,7 +36,7 @@ from launch.config import RunFile
 from launch.errors import LaunchError
 from launch.evaluator_best import BestCheckpoint, Judgement
 from launch.join import HELD_OUT, SCENES, JoinConfig, check_bank, joined
-from launch.learning import CHECKPOINTS, TENSORBOARD
+from launch.progress import CHECKPOINTS, TENSORBOARD
 from launch.status import STATUS_S
 from learner.checkpoint import latest_checkpoint
 from learner.curves import STEP, CurvesWriter, read_curves

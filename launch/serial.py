@@ -20,7 +20,8 @@ from actors.network import layout_hash
 from launch.config import ExperimentConfig, RunFile, rows_of_run
 from launch.console import Status, line_of, snapshot
 from launch.join import REPLAY, SCENES, TRAIN
-from launch.learning import Progress, Reporter, make_learner, make_render, resume, spent
+from launch.learning import make_learner, make_render
+from launch.progress import Progress, Reporter, resume, spent
 from launch.roles import ActorStatus, acting_config
 from learner.learner import Learner, LearnStep, learn
 from replay.local import LocalReplay

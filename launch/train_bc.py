@@ -25,11 +25,9 @@ import numpy as np
 import tyro
 
 from launch.cloning import (
-    CloneReporter,
     count_rows,
     make_cloner,
     make_render_before,
-    resume_cloning,
     rows_to_clone,
     with_straying,
 )
@@ -45,8 +43,8 @@ from launch.errors import INTERRUPTED, LaunchError
 from launch.evaluator import CheckpointJudge
 from launch.evaluator_best import Judgement
 from launch.join import SCENES, TRAIN
-from launch.learning import spent
 from launch.placement import Placement
+from launch.progress import Progress, Reporter, resume, spent
 from launch.scenes import PROCEDURAL
 from launch.train import TrainConfig, finish, prepare, supervised
 from learner.cloning import clone
@@ -123,21 +121,13 @@ def clone_serially(folder: Path, run: RunFile) -> None:
     """Clones in this process until the budget is spent."""
     config = run.config
     learner = make_cloner(config)
-    before_s = resume_cloning(learner, folder)
+    progress = Progress(resume(learner, folder))
     train = open_bank(folder / SCENES / TRAIN)
     rows = rows_to_clone(run, train.bank)
     rng = np.random.default_rng([config.seed, learner.updates])
     judge = CheckpointJudge(folder, run) if config.evaluator.scenes else None
-    due = 0.0
-
-    def saved() -> None:
-        nonlocal due
-        if time.monotonic() >= due:
-            due = time.monotonic() + config.evaluator.seconds
-            _look(judge, reporter, config.evaluator.updates)
-
-    reporter = CloneReporter(
-        learner=learner, config=config, folder=folder, before_s=before_s, saved=saved
+    reporter = Reporter(
+        learner=learner, config=config, folder=folder, progress=progress
     )
 
     def draw() -> np.ndarray:
@@ -148,25 +138,28 @@ def clone_serially(folder: Path, run: RunFile) -> None:
         sample=with_straying(draw, config, learner.updates),
         render=make_render_before(train, config),
     )
+    due = 0.0
     for step in steps:
         if step is not None:
-            reporter.add(step)
-        reporter.look()
-        if spent(config, learner.updates, reporter.elapsed_s):
+            progress.add(step)
+        if reporter.look() and time.monotonic() >= due:
+            due = time.monotonic() + config.evaluator.seconds
+            _look(judge, progress, config.evaluator.updates)
+        if spent(config, learner.updates, progress.elapsed_s):
             break
     reporter.close()
-    _look(judge, reporter, 0)
+    _look(judge, progress, 0)
     if judge is not None:
         judge.close()
 
 
 def _look(
-    judge: CheckpointJudge | None, reporter: CloneReporter, least_updates: int
+    judge: CheckpointJudge | None, progress: Progress, least_updates: int
 ) -> None:
     """Judges the newest checkpoint if it is to be, and says how it did."""
     judged = judge.look(least_updates) if judge is not None else None
     if judged is not None:
-        say(_line(judged, reporter.elapsed_s))
+        say(_line(judged, progress.elapsed_s))
 
 
 def _line(judged: Judgement, elapsed_s: float) -> str:

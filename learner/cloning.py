@@ -13,7 +13,7 @@ equal stay equal.
 
 import functools
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple, final
 
 import numpy as np
@@ -191,12 +191,6 @@ class CloningLearner:
             self._dt,
         )
         return mixture_log_prob(distribution, scaled)
-
-
-def held_out(learner: CloningLearner, batches: Iterable[CloningBatch]) -> float:
-    """The mean log-likelihood of all rows of the batches [nats]."""
-    every = np.concatenate([learner.log_likelihood(batch) for batch in batches])
-    return float(every.mean())
 
 
 def cloning_batch(rows: np.ndarray, observation_tm1: Observation) -> CloningBatch:

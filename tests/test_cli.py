@@ -188,7 +188,8 @@ def test_a_checkpoint_of_another_network(
     bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Weights whose layout is not the one that their file promises."""
-    from launch.learning import checkpoint_extra, make_learner
+    from launch.learning import make_learner
+    from launch.progress import checkpoint_extra
     from learner.checkpoint import save_checkpoint
 
     config = quick()

@@ -18,7 +18,7 @@ import pytest
 from actors.policy import find_policy, read_policy
 from actors.rows import row_spec
 from launch.budget import BudgetConfig, ReportConfig, ScenesConfig
-from launch.cloning import COLUMNS, count_rows, dealt
+from launch.cloning import count_rows, dealt
 from launch.config import (
     CLONING_PRESETS,
     ExperimentConfig,
@@ -32,6 +32,7 @@ from launch.config import (
 from launch.errors import LaunchError
 from launch.main import main
 from launch.placement import Placement, roles_of
+from launch.progress import CLONING_COLUMNS
 from launch.train import TrainConfig, prepare
 from launch.train_bc import TrainBcConfig, clone_serially, prepare_cloning
 from learner.curves import read_curves
@@ -155,7 +156,7 @@ def test_a_run_goes_on_where_it_ended(tmp_path: Path) -> None:
     _, run = prepare_cloning(options(folder, config=longer, resume=True))
     clone_serially(folder, run)
     curves = read_curves(folder / "curves.csv")
-    assert set(COLUMNS) <= set(curves)
+    assert set(CLONING_COLUMNS) <= set(curves)
     assert (np.diff(curves["updates"]) >= 0).all()
     assert curves["updates"][-1] == 60
     judged = read_curves(folder / "evaluation.csv")
