@@ -5,13 +5,15 @@
     python -m tests.replay_fault_roles reader ENDPOINT
 
 All run until SIGTERM. The writer then prints how many rows are acknowledged, the
-reader how many it received and how many of them were damaged.
+reader how many it received, how many of them were damaged, and how many answers came
+by a stream: it shares no memory, so that all it draws crosses the link.
 """
 
 import contextlib
 import dataclasses
 import sys
 
+import replay.sampler
 from replay.client import ReplayTimeout, Sampler, Writer
 from replay.server import ReplayServer
 from replay.session import open_session
@@ -61,7 +63,9 @@ def write(endpoint: str, writer: int, epoch: int) -> None:
 def read(endpoint: str) -> None:
     """Samples as fast as it gets, and looks at every row."""
     stop, received, damaged = until_term(), 0, 0
-    session = open_session(connect=[endpoint], timeout_s=60.0)
+    replay.sampler.LEAST_BYTES = 1  # else these are too small
+    replay.sampler._STREAM_RETRY_S = 1.0
+    session = open_session(connect=[endpoint], timeout_s=60.0, shared_memory=False)
     sampler = Sampler(
         session=session, keys=KEYS, spec=CHECKED, batch_size=32, hold_s=HOLD_S
     )
@@ -70,7 +74,7 @@ def read(endpoint: str) -> None:
             rows = sampler.sample(0.2).rows
             received += len(rows)
             damaged += sum(int(row["crc"]) != checksum(row) for row in rows)
-    print("all", received, damaged, flush=True)
+    print("all", received, damaged, sampler.streamed, flush=True)
     session.close()
 
 
