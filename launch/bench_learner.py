@@ -1,11 +1,11 @@
 """`slipstream bench learner`: updates per second, against plain eager loops.
 
-In one process, with the same network, arrays and number of threads, the contestants
-take turns: ours in float32, ours in bfloat16, and the plain loop
-(`launch.bench_learner_peers`). A repetition is one turn of each, of at least
-`SAMPLE_S`; a figure is the median over the repetitions, a ratio the median of each
-repetition's. On one thread the clock is the process's own CPU time, which others on
-the machine disturb less; on more it is the wall's.
+With the same weights, arrays and number of threads, the contestants take turns: ours in
+float32, ours in bfloat16, and two plain loops (`launch.bench_learner_peers`), one with
+the network in plain form and one with the network in our form. A repetition is one turn
+of each, of at least `SAMPLE_S`; a figure is the median over the repetitions, a ratio
+the median of each repetition's. On one thread the clock is the process's own CPU time,
+which others on the machine disturb less; on more it is the wall's.
 
 `other_share` is the part of our update that is not the network: one minus the time of
 its forward passes and its backward pass run alone on tensors that are there already.
@@ -13,11 +13,13 @@ All of the network's operators count as its arithmetic: products, attention, nor
 activations.
 """
 
+import copy
 import dataclasses
+import functools
 import json
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -30,19 +32,29 @@ from rich.console import Console
 from rich.table import Table
 
 from launch.bench import machine
-from launch.bench_learner_peers import Turn, plain_cloning, torchrl_dqn
+from launch.bench_learner_peers import (
+    Apart,
+    Lasted,
+    Turn,
+    lasted,
+    plain_cloning,
+    plain_network,
+    torchrl_dqn,
+)
 from launch.bench_timing import processor_name
 from launch.config import CLONING_PRESETS, ExperimentConfig, paper, write_atomically
 from launch.errors import LaunchError
 from learner.cloning import CloningBatch, CloningLearner
 from learner.learner import Batch, Learner
 from learner.network import QNetwork, to_torch
-from learner.training import in_precision
+from learner.training import Precision, in_precision, keep_memory
 from sim.observation import Observation, ObservationSizes, observation_sizes
 
 SAMPLE_S: Final = 0.3
 VALID: Final = 0.8  # of the rows of a random observation
-PRECISIONS: Final[tuple[Literal["float32", "bfloat16"], ...]] = ("float32", "bfloat16")
+PRECISIONS: Final[tuple[Precision, ...]] = ("float32", "bfloat16")
+PEERS: Final = ("plain", "plain loop")
+Algorithm = Literal["dqn", "bc"]
 Row = dict[str, Any]
 
 
@@ -56,7 +68,7 @@ class BenchLearnerConfig:
         "paper",
     )
     """Networks and observations."""
-    algorithms: tuple[Literal["dqn", "bc"], ...] = ("dqn", "bc")
+    algorithms: tuple[Algorithm, ...] = ("dqn", "bc")
     """Double DQN at batch 64, behaviour cloning at batch 256."""
     threads: tuple[int, ...] = (1, 2)
     """Of torch; for everyone the same."""
@@ -90,78 +102,102 @@ def random_observation(
     )
 
 
-def dqn_turns(preset: ExperimentConfig, threads: int) -> dict[str, Turn]:
-    """The contestants of double DQN, and our network's passes alone."""
+def dqn_batch(preset: ExperimentConfig) -> Batch:
+    """Random transitions, as many as the paper's update has."""
     sizes = observation_sizes(preset.environment.observation)
-    actions = preset.environment.action.count
     rng = np.random.default_rng(0)
     rows = paper().learner.batch_size
-    batch = Batch(
+    return Batch(
         observation_tm1=random_observation(sizes, rows, rng),
-        a_tm1=rng.integers(0, actions, rows).astype(np.int32),
+        a_tm1=rng.integers(0, preset.environment.action.count, rows).astype(np.int32),
         r_t=-rng.integers(0, 2, rows).astype(np.float32),
         discount_t=(rng.random(rows) < 0.95).astype(np.float32),
         observation_t=random_observation(sizes, rows, rng),
         probabilities=rng.random(rows) + 0.01,
     )
 
-    def learner(precision: Literal["float32", "bfloat16"]) -> Learner:
-        config = dataclasses.replace(
+
+def dqn_learner(
+    preset: ExperimentConfig, threads: int, precision: Precision = "float32"
+) -> Learner:
+    """Double DQN with the paper's settings and the preset's network."""
+    return Learner(
+        config=dataclasses.replace(
             paper().learner, loss="plain", precision=precision, torch_threads=threads
-        )
-        return Learner(
-            config=config, network=preset.network, sizes=sizes, actions=actions
-        )
-
-    turns: dict[str, Turn] = {}
-    for precision in PRECISIONS:
-        ours = learner(precision)
-        turns[precision] = lambda ours=ours: ours.update(batch)  # type: ignore[misc]
-        turns[f"{precision} network"] = _passes(
-            ours.network, batch.observation_tm1, precision, [ours.network, ours.target]
-        )
-    peer = learner("float32")
-    turns["peer"] = torchrl_dqn(peer, peer.network, batch)
-    return turns
+        ),
+        network=preset.network,
+        sizes=observation_sizes(preset.environment.observation),
+        actions=preset.environment.action.count,
+    )
 
 
-def bc_turns(preset: ExperimentConfig, threads: int) -> dict[str, Turn]:
-    """The contestants of cloning, and our network's passes alone."""
-    sizes = observation_sizes(preset.environment.observation)
-    action = preset.environment.action
-    defaults = paper().cloning
+def bc_batch(preset: ExperimentConfig) -> CloningBatch:
+    """Random observations and actions, as many as the paper's update has."""
     rng = np.random.default_rng(0)
-    rows = defaults.batch_size
-    batch = CloningBatch(
+    rows = paper().cloning.batch_size
+    sizes = observation_sizes(preset.environment.observation)
+    return CloningBatch(
         random_observation(sizes, rows, rng),
-        rng.integers(0, action.count, rows).astype(np.int32),
+        rng.integers(0, preset.environment.action.count, rows).astype(np.int32),
         rng.uniform(-0.1, 0.1, (rows, 2)).astype(np.float32),
     )
 
-    def learner(precision: Literal["float32", "bfloat16"]) -> CloningLearner:
-        config = dataclasses.replace(
-            defaults, precision=precision, torch_threads=threads
-        )
-        return CloningLearner(
-            config=config, network=preset.network, sizes=sizes, action=action
-        )
 
+def bc_learner(
+    preset: ExperimentConfig, threads: int, precision: Precision = "float32"
+) -> CloningLearner:
+    """Cloning with the paper's settings and the preset's network."""
+    return CloningLearner(
+        config=dataclasses.replace(
+            paper().cloning, precision=precision, torch_threads=threads
+        ),
+        network=preset.network,
+        sizes=observation_sizes(preset.environment.observation),
+        action=preset.environment.action,
+    )
+
+
+def our_turns(
+    preset: ExperimentConfig, algorithm: Algorithm, threads: int
+) -> dict[str, Turn]:
+    """Our updates in each precision, and our network's passes alone."""
     turns: dict[str, Turn] = {}
     for precision in PRECISIONS:
-        ours = learner(precision)
-        turns[precision] = lambda ours=ours: ours.update(batch)  # type: ignore[misc]
-        turns[f"{precision} network"] = _passes(
-            ours.network, batch.observation_tm1, precision, []
-        )
-    peer = learner("float32")
-    turns["peer"] = plain_cloning(peer, action, peer.network, batch)
+        alone: list[QNetwork] = []  # passes without gradients
+        if algorithm == "dqn":
+            batch, ours = dqn_batch(preset), dqn_learner(preset, threads, precision)
+            turns[precision] = functools.partial(ours.update, batch)
+            network, seen = ours.network, batch.observation_tm1
+            alone = [ours.network, ours.target]
+        else:
+            taken, other = bc_batch(preset), bc_learner(preset, threads, precision)
+            turns[precision] = functools.partial(other.update, taken)
+            network, seen = other.network, taken.observation_tm1
+        turns[f"{precision} network"] = _passes(network, seen, precision, alone)
     return turns
+
+
+def peer_turns(preset: ExperimentConfig, algorithm: Algorithm) -> dict[str, Turn]:
+    """The plain loops, with the network in plain form and in ours."""
+    threads = torch.get_num_threads()
+    if algorithm == "dqn":
+        ours, batch = dqn_learner(preset, threads), dqn_batch(preset)
+        return {
+            "plain": torchrl_dqn(ours, plain_network(ours.network), batch),
+            "plain loop": torchrl_dqn(ours, copy.deepcopy(ours.network), batch),
+        }
+    other, taken = bc_learner(preset, threads), bc_batch(preset)
+    action = preset.environment.action
+    return {
+        "plain": plain_cloning(other, action, plain_network(other.network), taken),
+        "plain loop": plain_cloning(other, action, copy.deepcopy(other.network), taken),
+    }
 
 
 def _passes(
     network: QNetwork,
     observation: Observation,
-    precision: Literal["float32", "bfloat16"],
+    precision: Precision,
     without_gradient: list[QNetwork],
 ) -> Turn:
     """Forward and backward of the network, and forward of those without gradient."""
@@ -181,60 +217,41 @@ def _passes(
     return turn
 
 
-def measured(
-    turns: Mapping[str, Turn], *, repetitions: int, clock: Callable[[], float]
-) -> Row:
+def measured(contestants: Mapping[str, Lasted], *, repetitions: int) -> Row:
     """Rates, ratios and shares; the contestants take turns."""
-    spent: dict[str, list[float]] = {name: [] for name in turns}
-    loops = {name: _loop(turn, clock) for name, turn in turns.items()}
+    spent: dict[str, list[float]] = {name: [] for name in contestants}
+    calls = {name: _calls(run) for name, run in contestants.items()}
     for _ in range(repetitions):
-        for name, turn in turns.items():
-            spent[name].append(_lasted(turn, loops[name], clock))
-    row: Row = {
-        "peer_updates_per_s": 1 / statistics.median(spent["peer"]),
-        "calls": loops,
-    }
+        for name, run in contestants.items():
+            spent[name].append(run(calls[name]))
+    row: Row = {"calls": calls}
+    for name in PEERS:
+        row[name] = {"updates_per_s": 1 / statistics.median(spent[name])}
     for name in PRECISIONS:
-        pairs = zip(spent["peer"], spent[name], strict=True)
         passes = zip(spent[f"{name} network"], spent[name], strict=True)
-        ratios = [peer / own for peer, own in pairs]
         row[name] = {
             "updates_per_s": 1 / statistics.median(spent[name]),
-            "ratios": ratios,
-            "ratio": statistics.median(ratios),
             "other_share": 1 - statistics.median(own / all_ for own, all_ in passes),
         }
+        for peer in PEERS:
+            pairs = zip(spent[peer], spent[name], strict=True)
+            ratios = [other / own for other, own in pairs]
+            row[name][f"over {peer}"] = statistics.median(ratios)
+            row[name][f"over {peer}, each"] = ratios
     return row
 
 
-def _loop(turn: Turn, clock: Callable[[], float]) -> int:
+def _calls(run: Lasted) -> int:
     """Calls that take about `SAMPLE_S`; the first one warms up and does not count."""
-    turn()
-    return max(1, round(SAMPLE_S / max(_lasted(turn, 1, clock), 1e-6)))
-
-
-def _lasted(turn: Turn, times: int, clock: Callable[[], float]) -> float:
-    begin = clock()
-    for _ in range(times):
-        turn()
-    return (clock() - begin) / times
+    run(1)
+    return max(1, round(SAMPLE_S / max(run(1), 1e-6)))
 
 
 def bench_learner_command(options: BenchLearnerConfig) -> int:
     """`slipstream bench learner`."""
     if options.repetitions < 1 or min(options.threads, default=0) < 1:
         raise LaunchError("--repetitions and --threads must be at least 1")
-    makers = {"dqn": dqn_turns, "bc": bc_turns}
-    rows: list[Row] = []
-    for threads in options.threads:
-        clock = time.process_time if threads == 1 else time.perf_counter
-        for preset in options.presets:
-            config = CLONING_PRESETS[preset]()
-            for algorithm in options.algorithms:
-                turns = makers[algorithm](config, threads)
-                figures = measured(turns, repetitions=options.repetitions, clock=clock)
-                about = {"preset": preset, "algorithm": algorithm, "threads": threads}
-                rows.append({**about, "clock": clock.__name__, **figures})
+    rows = _rows(options)
     content = {
         "machine": {
             **machine(),
@@ -255,16 +272,37 @@ def bench_learner_command(options: BenchLearnerConfig) -> int:
     return 0
 
 
+def _rows(options: BenchLearnerConfig) -> list[Row]:
+    rows: list[Row] = []
+    peers = Apart(peer_turns)
+    keep_memory()  # as the learner's process does
+    for threads in options.threads:
+        clock = time.process_time if threads == 1 else time.perf_counter
+        for preset in options.presets:
+            config = CLONING_PRESETS[preset]()
+            for algorithm in options.algorithms:
+                contestants = peers.contestants(threads, config, algorithm)
+                for name, turn in our_turns(config, algorithm, threads).items():
+                    contestants[name] = lasted(turn, clock)
+                figures = measured(contestants, repetitions=options.repetitions)
+                about = {"preset": preset, "algorithm": algorithm, "threads": threads}
+                rows.append({**about, "clock": clock.__name__, **figures})
+    peers.close()
+    return rows
+
+
 def _table(rows: list[Row]) -> Table:
-    table = Table(
-        "", "threads", "plain/s", "float32/s", "x", "other", "bfloat16/s", "x", "other"
-    )
+    table = Table("", "threads", "plain/s", "its loop/s")
+    for name in PRECISIONS:
+        for column in (f"{name}/s", "x", "x loop", "other"):
+            table.add_column(column)
     for row in rows:
         cells = [f"{row['preset']} {row['algorithm']}", str(row["threads"])]
-        cells.append(f"{row['peer_updates_per_s']:.2f}")
+        cells += [f"{row[name]['updates_per_s']:.2f}" for name in PEERS]
         for name in PRECISIONS:
             own = row[name]
-            cells += [f"{own['updates_per_s']:.2f}", f"{own['ratio']:.2f}"]
+            cells.append(f"{own['updates_per_s']:.2f}")
+            cells += [f"{own[f'over {peer}']:.2f}" for peer in PEERS]
             cells.append(f"{own['other_share']:.0%}")
         table.add_row(*cells)
     return table
@@ -280,7 +318,7 @@ def _plot(rows: list[Row], folder: Path) -> None:
     figure, axes = pyplot.subplots(figsize=(8, 0.5 * len(rows) + 1.5))
     places = np.arange(len(rows))
     for index, name in enumerate(PRECISIONS):
-        ratios = [row[name]["ratio"] for row in rows]
+        ratios = [row[name]["over plain"] for row in rows]
         axes.barh(places + 0.4 * index - 0.2, ratios, 0.38, label=name)
     axes.axvline(1, color="black", linewidth=0.8)
     axes.set_yticks(

@@ -3,24 +3,97 @@
 Double DQN as torchrl's manual writes it: `DQNLoss` runs the networks, `HardUpdate`
 copies the target, and Adam is as it comes. It neither weighs by importance nor clips,
 which is less work than ours does. Cloning with `torch.distributions`, as one would
-write it first. Both have the same network as ours and get the same arrays.
+write it first. They get the same arrays, and the network of the same weights and
+outputs in two forms: plain, which forms keys, values and all outputs of every layer as
+one would write it first, and ours.
+
+They run in a process of their own: a learner's process tells the C library to keep
+freed memory (`learner.training.keep_memory`), which would be theirs, too.
 """
 
+import copy
+import multiprocessing
+import time
 from collections.abc import Callable
-from typing import Any
+from multiprocessing.connection import Connection
+from typing import Any, final
 
 import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
 from torch import distributions as D
 
 from actors.mixture import LARGEST, SMALLEST, action_limits
 from learner.cloning import CloningBatch, CloningLearner
 from learner.learner import Batch, Learner
 from learner.network import QNetwork, to_torch
+from learner.network_blocks import CrossBlock, LatentBlock, mask_bias
 from sim.dynamics import ActionConfig
 from sim.observation import Observation
 
 Turn = Callable[[], object]
+Lasted = Callable[[int], float]  # so many calls; the seconds that one took
 _CPU = torch.device("cpu")
+
+
+@final
+class PlainBlock(nn.Module):
+    """A layer of attention and feed-forward, written as one would first."""
+
+    query_norm: nn.LayerNorm
+    query: nn.Linear  # this and the next two: of a cross block
+    key: nn.Linear
+    value: nn.Linear
+    query_key_value: nn.Linear  # of a latent block
+    out: nn.Linear
+    feedforward_norm: nn.LayerNorm
+    expand: nn.Linear
+    contract: nn.Linear
+
+    def __init__(self, block: CrossBlock | LatentBlock) -> None:
+        """Takes the block's layers over."""
+        nn.Module.__init__(self)
+        self.heads = block.heads
+        for name, layer in block.named_children():
+            self.add_module(name, layer)
+
+    def forward(
+        self,
+        latents: Tensor,
+        tokens: Tensor | None = None,
+        bias: Tensor | None = None,
+        some: Tensor | None = None,
+        *,
+        pooled: bool = False,
+    ) -> Tensor:
+        """`CrossBlock.forward`, or without bias `LatentBlock.forward`."""
+        normed = self.query_norm(latents)
+        if bias is not None:
+            q, k, v = self.query(normed), self.key(tokens), self.value(tokens)
+        else:
+            q, k, v = self.query_key_value(normed).chunk(3, -1)
+            if tokens is not None:  # the mask, of a layer among tokens
+                bias, some = mask_bias(tokens), tokens.any(-1)[:, None, None]
+
+        def split(x: Tensor) -> Tensor:
+            return x.view(*x.shape[:2], self.heads, -1).transpose(1, 2)
+
+        mask = None if bias is None else bias[:, None]
+        y = F.scaled_dot_product_attention(split(q), split(k), split(v), attn_mask=mask)
+        told = self.out(y.transpose(1, 2).reshape(latents.shape))
+        latents = latents + (told if some is None else told * some)
+        hidden = F.gelu(self.expand(self.feedforward_norm(latents)), approximate="tanh")
+        y = latents + self.contract(hidden)
+        return y.mean(dim=1) if pooled else y
+
+
+def plain_network(network: QNetwork) -> QNetwork:
+    """A copy with the same weights and outputs, of plain layers."""
+    plain = copy.deepcopy(network)
+    for name in ("tokens", "cross", "latent"):
+        blocks = [PlainBlock(block) for block in getattr(plain, name)]
+        setattr(plain, name, nn.ModuleList(blocks))
+    return plain
 
 
 def torchrl_dqn(ours: Learner, network: QNetwork, batch: Batch) -> Turn:
@@ -105,3 +178,65 @@ def mixture_density(
         D.Categorical(logits=outputs[:, :mixture]),
         D.Independent(squashed, 1),
     )
+
+
+def lasted(turn: Turn, clock: Callable[[], float]) -> Lasted:
+    """How long a contestant of this process takes."""
+
+    def run(times: int) -> float:
+        begin = clock()
+        for _ in range(times):
+            turn()
+        return (clock() - begin) / times
+
+    return run
+
+
+@final
+class Apart:
+    """Contestants in a process of their own, which make their turns when asked to."""
+
+    def __init__(self, make: Callable[..., dict[str, Turn]]) -> None:
+        """Starts the process; `make` is a function of a module, run there."""
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(make, theirs), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def contestants(self, threads: int, *words: object) -> dict[str, Lasted]:
+        """What `make` makes of these words, timed there."""
+        self._pipe.send((threads, words))
+        names: list[str] = self._pipe.recv()
+
+        def of(name: str) -> Lasted:
+            return lambda times: self._lasted(name, times)
+
+        return {name: of(name) for name in names}
+
+    def _lasted(self, name: str, times: int) -> float:
+        self._pipe.send((name, times))
+        return float(self._pipe.recv())
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._pipe.close()
+        self._process.join()
+
+
+def _serve(make: Callable[..., dict[str, Turn]], pipe: Connection) -> None:
+    """Answers until the other end is closed."""
+    contestants: dict[str, Lasted] = {}
+    while True:
+        try:
+            first, second = pipe.recv()
+        except EOFError:
+            return
+        if isinstance(first, str):
+            pipe.send(contestants[first](second))
+            continue
+        torch.set_num_threads(first)
+        clock = time.process_time if first == 1 else time.perf_counter
+        turns = make(*second)
+        contestants = {name: lasted(turn, clock) for name, turn in turns.items()}
+        pipe.send(list(contestants))

@@ -27,6 +27,7 @@ from launch.join import JoinConfig, Joined, joined, train_bank
 from launch.progress import Progress, Reporter, resume, spent
 from launch.status import STATUS_S
 from learner.cloning import CloningLearner, clone
+from learner.training import keep_memory
 from replay.channels import StatusPublisher
 from replay.client import ReplayTimeout, Writer
 from replay.shards_directory import ShardDirectory
@@ -63,6 +64,7 @@ def rows_to_clone(run: RunFile, bank: Bank) -> np.ndarray:
 
 def make_cloner(config: ExperimentConfig) -> CloningLearner:
     """The learner of a run, with the run's seed."""
+    keep_memory()
     return CloningLearner(
         config=dataclasses.replace(config.cloning, seed=config.seed),
         network=config.network,

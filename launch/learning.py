@@ -20,6 +20,7 @@ from launch.join import JoinConfig, Joined, joined, train_bank
 from launch.progress import Progress, Reporter, resume, spent
 from launch.status import actor_rates
 from learner.learner import Learner, learn
+from learner.training import keep_memory
 from replay.channels import StatusPublisher, StatusSubscriber
 from replay.client import ReplayTimeout
 from replay.shards_sampler import ShardedSampler
@@ -35,6 +36,7 @@ Render = Callable[[np.ndarray], tuple[Observation, Observation]]
 
 def make_learner(config: ExperimentConfig) -> Learner:
     """The learner of a run, with the run's seed."""
+    keep_memory()
     return Learner(
         config=dataclasses.replace(config.learner, seed=config.seed),
         network=config.network,

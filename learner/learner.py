@@ -42,7 +42,6 @@ from learner.training import (
     compute_device,
     flatten,
     in_precision,
-    keep_memory,
     make_adam,
     restore_training,
     step_down,
@@ -85,12 +84,8 @@ class Learner:
         sizes: ObservationSizes,
         actions: int,
     ) -> None:
-        """Draws the first weights from the seed.
-
-        Sets torch's thread count, and the process to keep its memory.
-        """
+        """Draws the first weights from the seed. Sets torch's thread count."""
         torch.set_num_threads(config.torch_threads)
-        keep_memory()
         self.config = config
         self.network_config = network
         self.sizes = sizes

@@ -10,11 +10,12 @@ import torch
 
 from actors.network import NetworkConfig
 from launch import bench_learner
-from launch.bench_learner import bc_turns, dqn_turns, measured
-from launch.bench_learner_peers import mixture_density
+from launch.bench_learner import measured, our_turns, peer_turns
+from launch.bench_learner_peers import lasted, mixture_density, plain_network
 from launch.config import quick
 from launch.main import main
 from learner.mixture import mixture_log_prob, split_mixture
+from tests.networks import make_network, make_observations, run_torch
 
 TINY = dataclasses.replace(
     quick(), network=NetworkConfig(width=16, heads=2, latents=2, mlp_layers=1)
@@ -30,35 +31,46 @@ def test_the_plain_mixture_is_ours():
     torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-3)
 
 
-def test_the_plain_loops_start_from_our_loss():
-    turns = bc_turns(TINY, 1)
-    assert turns["peer"]() == pytest.approx(turns["float32"]().loss, rel=1e-4)
-    turns = dqn_turns(TINY, 1)
-    ours, (squared, _) = turns["float32"](), turns["peer"]()
-    np.testing.assert_allclose(ours.priorities, squared[:, 0] ** 0.5, atol=1e-3)
+@pytest.mark.parametrize("algorithm", ["dqn", "bc"])
+def test_the_plain_loops_start_from_our_loss(algorithm):
+    ours = our_turns(TINY, algorithm, 1)["float32"]()
+    for turn in peer_turns(TINY, algorithm).values():
+        if algorithm == "bc":
+            assert turn() == pytest.approx(ours.loss, rel=1e-4)
+        else:
+            squared, _ = turn()
+            np.testing.assert_allclose(ours.priorities, squared[:, 0] ** 0.5, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "fields", [{}, {"latents": 9}, {"fusion": "late", "token_layers": 1}]
+)
+def test_the_plain_network_is_ours(fields):
+    network = make_network(NetworkConfig(width=16, heads=2, self_layers=1, **fields))
+    observations = make_observations(5, share=0.3)
+    expected = run_torch(plain_network(network), observations)
+    np.testing.assert_allclose(run_torch(network, observations), expected, atol=1e-5)
 
 
 def test_rates_ratios_and_shares():
-    ticks = itertools.count()
-    now = [0.0]
-
-    def takes(seconds):
-        def turn():
-            next(ticks)
-            now[0] += seconds
-
-        return turn
-
-    costs = {"float32": 0.2, "float32 network": 0.15, "peer": 0.4}
+    costs = {"float32": 0.2, "float32 network": 0.15, "plain": 0.4, "plain loop": 0.3}
     costs |= {"bfloat16": 0.1, "bfloat16 network": 0.1}
-    turns = {name: takes(cost) for name, cost in costs.items()}
-    row = measured(turns, repetitions=3, clock=lambda: now[0])
-    assert row["peer_updates_per_s"] == pytest.approx(2.5)
-    assert row["float32"]["ratio"] == pytest.approx(2.0)
+    runs = {name: lambda times, cost=cost: cost for name, cost in costs.items()}
+    row = measured(runs, repetitions=3)
+    assert row["plain"]["updates_per_s"] == pytest.approx(2.5)
+    assert row["float32"]["over plain"] == pytest.approx(2.0)
+    assert row["float32"]["over plain loop"] == pytest.approx(1.5)
     assert row["float32"]["other_share"] == pytest.approx(0.25)
-    assert row["bfloat16"]["ratios"] == pytest.approx([4.0] * 3)
+    assert row["bfloat16"]["over plain, each"] == pytest.approx([4.0] * 3)
+    assert row["calls"]["bfloat16"] == 3
 
 
+def test_a_turn_lasts_what_the_clock_says():
+    now = itertools.count(step=0.5)
+    assert lasted(lambda: next(now), lambda: next(now))(3) == pytest.approx(2.0 / 3)
+
+
+@pytest.mark.slow
 def test_the_command_writes_what_it_prints(tmp_path, monkeypatch):
     monkeypatch.setattr(bench_learner, "CLONING_PRESETS", {"quick": lambda: TINY})
     monkeypatch.setattr(bench_learner, "SAMPLE_S", 1e-3)
@@ -68,7 +80,7 @@ def test_the_command_writes_what_it_prints(tmp_path, monkeypatch):
     assert main(words) == 0
     rows = json.loads(file.read_text())["rows"]
     assert [row["algorithm"] for row in rows] == ["dqn", "bc"]
-    assert all(row["float32"]["ratio"] > 0 for row in rows)
+    assert all(row["float32"]["over plain"] > 0 for row in rows)
     assert (tmp_path / "learner.png").stat().st_size > 1000
 
 
