@@ -163,7 +163,10 @@ class ReplyStreams:
         for host in _hosts(str(link.src) for link in links):
             if host not in self._listeners:
                 self._listen(host)
-        ports = {host: s.getsockname()[1] for host, s in self._listeners.items()}
+        ports = {}
+        for host, listener in list(self._listeners.items()):
+            with suppress(OSError):  # it has just been closed
+                ports[host] = listener.getsockname()[1]
         return StreamOffer(ports=ports, token=self._token)
 
     def room(self, place: StreamPlace, length: int) -> memoryview | None:
@@ -180,7 +183,7 @@ class ReplyStreams:
     def close(self) -> None:
         """Ends all connections."""
         self._ended = True
-        for listener in self._listeners.values():
+        for listener in list(self._listeners.values()):
             _end(listener)
         for connection in list(self._connections.values()):
             connection.end()
@@ -192,13 +195,16 @@ class ReplyStreams:
         except OSError:
             return  # then there is none, and answers go by Zenoh
         self._listeners[host] = listener
-        threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
+        threading.Thread(target=self._accept, args=(host,), daemon=True).start()
 
-    def _accept(self, listener: socket.socket) -> None:
-        while not self._ended:
+    def _accept(self, host: str) -> None:
+        listener = self._listeners[host]
+        while True:
             try:
                 connection, _ = listener.accept()
-            except OSError:
+            except OSError:  # it was closed, or no more files may be opened
+                self._listeners.pop(host, None)  # the next offer listens anew
+                listener.close()
                 return
             if not self._greeting.acquire(blocking=False):
                 connection.close()

@@ -213,6 +213,23 @@ def test_connections_are_limited(
         assert again.recv(1) == b"\x01"
 
 
+def test_a_listener_that_failed_is_replaced(
+    offered: tuple[Service, tuple[str, int], bytes],
+) -> None:
+    running, (host, port), token = offered
+    running.server._streams._listeners[host].shutdown(socket.SHUT_RDWR)
+
+    def offer() -> StreamOffer:
+        payload = ask(running.client, KEYS.stream, timeout_s=20.0)
+        assert payload is not None
+        return decode(payload, StreamOffer)
+
+    assert eventually(lambda: offer().ports.get(host, port) != port)
+    with socket.create_connection((host, offer().ports[host]), 10.0) as again:
+        again.sendall(b"SLSTREAM" + token + bytes(16))
+        assert again.recv(1) == b"\x01"
+
+
 def test_who_does_not_read_is_answered_by_zenoh(
     offered: tuple[Service, tuple[str, int], bytes],
 ) -> None:
