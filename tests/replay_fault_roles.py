@@ -4,16 +4,19 @@
     python -m tests.replay_fault_roles writer ENDPOINT WRITER EPOCH
     python -m tests.replay_fault_roles reader ENDPOINT
 
-All run until SIGTERM. The writer then prints how many rows are acknowledged, the
-reader how many it received, how many of them were damaged, and how many answers came
-by a stream: it shares no memory, so that all it draws crosses the link.
+LEASE_S in the environment replaces the session's lease of a minute. All run until
+SIGTERM. The writer then prints how many rows are acknowledged, the reader how many it
+received, how many of them were damaged, and how many answers came by a stream: it
+shares no memory, so that all it draws crosses the link.
 """
 
 import contextlib
 import dataclasses
+import os
 import sys
 
 import replay.sampler
+import replay.session
 from replay.client import ReplayTimeout, Sampler, Writer
 from replay.server import ReplayServer
 from replay.session import open_session
@@ -79,6 +82,7 @@ def read(endpoint: str) -> None:
 
 
 if __name__ == "__main__":
+    replay.session.STALL_S = float(os.environ.get("LEASE_S", replay.session.STALL_S))
     if sys.argv[1] == "service":
         serve(sys.argv[2])
     elif sys.argv[1] == "writer":

@@ -8,6 +8,7 @@ at the service over a link that nothing is wrong with.
 import contextlib
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -194,6 +195,46 @@ def test_links_that_lose_delay_reset_and_cut() -> None:
         assert after[0] - before[0] < 1000  # what was on its way
         order(link, "cut 0")
         print(f"cut for {QUERY_S + 2:g} s: on after {run.goes_on(30.0):.1f} s")
+        run.finish()
+
+
+def connections(service: Process) -> int:
+    """Sessions' TCP connections to the service, over the link that may be cut."""
+    ours = f"{socket.inet_aton(ADDRESSES[0])[::-1].hex().upper()}:{PORT:04X}"
+    lines = Path(f"/proc/{service.pid}/net/tcp").read_text().splitlines()[1:]
+    words = [line.split() for line in lines]
+    return sum(w[1] == ours and w[3] == "01" for w in words)  # established
+
+
+def test_a_link_that_is_cut_for_longer_than_its_lease(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The service gives its clients up; they come back, every row is there once.
+
+    The lease is 5 s here; to try the minute that it is in a run, set LONG_LEASE_S=60.
+    """
+    lease = float(os.environ.get("LONG_LEASE_S", "5"))
+    monkeypatch.setenv("LEASE_S", str(lease))
+    with contextlib.ExitStack() as stack:
+        names = stack.enter_context(namespaces())
+        link = stack.enter_context(module("replay_link", *names))
+        assert told(link) == "ready"
+        run = stack.enter_context(
+            run_of(
+                serving=f"tcp/{ADDRESSES[0]}:{PORT}",
+                watched=f"tcp/{WATCHED[1]}:{PORT}",
+                inside=names,
+            )
+        )
+        run.goes_on(20.0)
+        assert connections(run.service) == 3
+        order(link, "cut 1")
+        assert eventually(lambda: connections(run.service) == 0, 3 * lease + 10.0)
+        before = run.counts()
+        time.sleep(2.0)
+        assert run.counts() == before
+        order(link, "cut 0")
+        print(f"cut for longer than {lease:g} s: on after {run.goes_on(60.0):.1f} s")
         run.finish()
 
 
