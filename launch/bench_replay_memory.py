@@ -1,25 +1,29 @@
 """Section `memory` of `slipstream bench replay`: what a row takes.
 
-A service's process is looked at with two numbers of rows, in two starts; what it grew
-by between them, divided by the rows between them, is what a row takes: programs and
-buffers of a constant size fall out. Counted are all pages of the process, anonymous
-and mapped. Nothing is sampled: tables fill up to `min_size`, which is all of them.
+A service's process is looked at twice in one life: when the first rows are stored, and
+when its table is full. What it grew by, divided by the rows between, is what a row
+takes. Programs fall out; buffers that grow with the traffic do not. Two starts, or
+looks while the table fills, differ by megabytes of what is on its way. Counted is what
+the process has to itself, anonymous pages and those of its mapped files, as
+`tests/test_replay_memory.py` counts. Nothing is sampled: tables fill up to `min_size`,
+which is all of them.
 """
 
+import time
 from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
 
 from actors.rows import row_spec
-from launch.bench_replay_runs import Contestant, Crew, Crewed
+from launch.bench_replay_runs import LOOK_S, Contestant, Crew, Crewed
 from launch.bench_replay_sections import OURS, PRESET, TORCHRL, Row, Sizes
 from launch.config import PRESETS
 from launch.converting import say
 from replay.wire import SampleReplyBuffer, SampleRequest
 from replay.wire_inserts import Insert
 
-FACTOR: Final = 4  # between the two numbers of rows
+SETTLING: Final = 10  # looks at a full table
 KILOBYTES: Final = 8192  # of the rows that peers are compared on
 
 
@@ -31,11 +35,7 @@ def memory(sizes: Sizes, peer: Contestant | None) -> Iterator[Row]:
             turns.append((TORCHRL[0], False))
         for contestant, durable in turns:
             say(f"memory: {contestant.label}, {count:,} rows of {row_bytes} B")
-            held = [
-                _resident(contestant, sizes, row_bytes, rows, durable)
-                for rows in (count // FACTOR, count)
-            ]
-            grown = (held[1] - held[0]) / (count - count // FACTOR)
+            grown = _grown(contestant, sizes, row_bytes, count, durable)
             yield {
                 "what": "process",
                 "contestant": contestant.name,
@@ -48,16 +48,25 @@ def memory(sizes: Sizes, peer: Contestant | None) -> Iterator[Row]:
     yield {"what": "messages", **message_bytes()}
 
 
-def _resident(
+def _grown(
     contestant: Contestant, sizes: Sizes, row_bytes: int, rows: int, durable: bool
 ) -> float:
-    """Of a service that holds so many rows."""
+    """Bytes that a service grows by for each row that it takes in."""
     load = sizes.workload(
         row_bytes=row_bytes, capacity=rows, min_size=rows, durable=durable
     )
     with Crewed(contestant, load, Crew(reader=False)) as crewed:
+        stored, held = 0.0, 0
+        while stored == 0.0:
+            held = crewed.own_bytes("service-0")
+            stored = crewed.look()["writers"]["stored"]
         crewed.fill(rows)
-        return crewed.look()["service-0"]["resident_bytes"]
+        # Until what is on its way has arrived and its buffers are let go.
+        looks = []
+        for _ in range(SETTLING):
+            time.sleep(LOOK_S)
+            looks.append(crewed.own_bytes("service-0"))
+        return (min(looks) - held) / (rows - min(stored, rows / 2))
 
 
 def message_bytes(batch: int = 64) -> dict[str, Any]:

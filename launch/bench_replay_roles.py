@@ -109,20 +109,17 @@ def writers(wanted: Request) -> None:
     spec = spec_of(load)
     rows = _rows(load, spec)
     counts = [Counts() for _ in range(wanted["writers"])]
-    line = Line(lambda: _sum(counts))
+    sinks: list[Writer] = []
+    line = Line(lambda: {**_sum(counts), "stored": sum(s.acknowledged for s in sinks)})
     with ExitStack() as stack:
         sessions = _sessions(wanted, stack)
-        threads = [
-            threading.Thread(
-                target=_write,
-                args=(
-                    _writer(sessions[number % len(sessions)], spec, load, number),
-                    rows,
-                    counts[number],
-                    line.ended,
-                ),
-            )
+        sinks += [
+            _writer(sessions[number % len(sessions)], spec, load, number)
             for number in range(wanted["writers"])
+        ]
+        threads = [
+            threading.Thread(target=_write, args=(sink, rows, count, line.ended))
+            for sink, count in zip(sinks, counts, strict=True)
         ]
         for thread in threads:
             thread.start()

@@ -125,6 +125,10 @@ class Child:
         told["resident_bytes"] = self._account.memory_info().rss
         return told
 
+    def own_bytes(self) -> int:
+        """Pages that no other process has, anonymous or of its files."""
+        return int(self._account.memory_full_info().uss)
+
     def _answer(self, patience_s: float) -> dict[str, float]:
         out = self._process.stdout
         assert out is not None
@@ -250,6 +254,11 @@ class Crewed:
     def look(self) -> dict[str, dict[str, float]]:
         """Every process's counters."""
         return {child.kind: child.look() for child in self._children}
+
+    def own_bytes(self, kind: str) -> int:
+        """Memory that one process has to itself."""
+        (only,) = (child for child in self._children if child.kind == kind)
+        return only.own_bytes()
 
     def fill(self, rows: int) -> None:
         """Until so many rows were inserted."""

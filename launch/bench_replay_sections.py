@@ -37,7 +37,7 @@ class Sizes:
     min_size: int = 16_000  # most of a ring is filled before the limiter counts
     batches_per_reply: int = 8
     scenes: int = 16  # of the bank that rows are rendered from
-    memory_rows: tuple[tuple[int, int], ...] = ((8192, 1 << 14), (128, 1 << 19))
+    memory_rows: tuple[tuple[int, int], ...] = ((8192, 1 << 14), (128, 1 << 20))
     shards: tuple[int, ...] = (1, 2, 3, 4)
     writers: tuple[int, ...] = (1, 4, 16, 64)
     soak_seconds: float = 600.0

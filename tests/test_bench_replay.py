@@ -192,7 +192,7 @@ def test_memory_is_what_the_process_grew_by(tmp_path: Path) -> None:
         ("slipstream", True),
         ("torchrl", False),
     ]
-    assert 0.8 < eight[0]["over_own_bytes"] < 3.0  # of few rows
+    assert all(0.9 < r["over_own_bytes"] < 1.3 for r in eight[:2])  # of few rows
     assert messages["row_bytes"] == 128
 
 
