@@ -132,7 +132,7 @@ def run_actor(
     running = jax.jit(acting.start, static_argnums=2)(start_key, begin, len(epsilon))
     windows = Windows(n_step=config.n_step, discount=config.discount, actor=actor)
     batch_rows = len(epsilon) * config.scan_steps
-    version, vector = -1, jnp.zeros(0)
+    version, vector, chances = -1, jnp.zeros(0), jnp.asarray(epsilon)
     steps = 0
     while True:
         weights = latest()
@@ -140,9 +140,8 @@ def run_actor(
             version, vector = weights.version, _on_device(weights.vector)
         began = time.perf_counter()
         key, scan_key = jax.random.split(key)
-        running, batch = act(
-            scan_key, bank, begin, vector, running, jnp.asarray(epsilon)
-        )
+        running, batch = act(scan_key, bank, begin, vector, running, chances)
+        # The one wait for the device, and the one transfer, of a scan.
         transitions: Transitions = jax.device_get(batch)
         acted = time.perf_counter()
         steps += int(transitions.present.sum())

@@ -21,6 +21,8 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
+from launch.devices import find_devices
+
 Verdict = Literal["ok", "warning", "error"]
 PACKAGES: Final = {
     "numpy": "base",
@@ -175,8 +177,8 @@ def jax_devices() -> Finding:
     """Where JAX computes."""
     import jax
 
-    devices = jax.devices()
-    return Finding("jax", "ok", ", ".join(str(device) for device in devices))
+    devices = ", ".join(str(device) for device in jax.devices())
+    return Finding("jax", "ok", f"{jax.default_backend()}: {devices}")
 
 
 def torch_devices() -> Finding:
@@ -186,9 +188,27 @@ def torch_devices() -> Finding:
     except ImportError:
         advice = "only the learner needs it: pip install 'slipstream[learner]'"
         return Finding("torch", "warning", "not installed", advice)
+    built = torch.version.cuda
     count = torch.cuda.device_count()
-    names = ", ".join(torch.cuda.get_device_name(index) for index in range(count))
-    return Finding("torch", "ok", f"cpu{', ' + names if names else ''}")
+    words = [torch.cuda.get_device_name(index) for index in range(count)]
+    if not words:
+        words = [f"no CUDA device (built for {built})" if built else "no CUDA build"]
+    return Finding("torch", "ok", f"cpu: {_precisions()}; {', '.join(words)}")
+
+
+def _precisions() -> str:
+    """What the processor multiplies fast."""
+    import torch
+
+    fast = torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+    return "float32 and bfloat16" if fast else "float32, bfloat16 slowly"
+
+
+def devices() -> Finding:
+    """What a run would use."""
+    found = find_devices()
+    advice = found.advice()
+    return Finding("devices", "warning" if advice else "ok", found.use(), advice)
 
 
 def rerun() -> Finding:
@@ -217,6 +237,7 @@ CHECKS: Final[tuple[tuple[str, Callable[[], Finding]], ...]] = (
     ("zenoh", zenoh_loopback),
     ("jax", jax_devices),
     ("torch", torch_devices),
+    ("devices", devices),
     ("rerun", rerun),
 )
 

@@ -16,6 +16,7 @@ from typing import Any, Final, final
 
 import tyro
 
+from launch.devices import share_gpu
 from launch.errors import INTERRUPTED, USER_ERROR, LaunchError, user_message
 
 
@@ -245,6 +246,7 @@ def _dispatch(words: list[str]) -> int:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Runs a command; the exit code."""
+    share_gpu()
     try:
         return _dispatch(list(sys.argv[1:] if words is None else words))
     except KeyboardInterrupt:

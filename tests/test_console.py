@@ -127,7 +127,7 @@ def test_a_benchmark_of_no_time_is_refused() -> None:
 
 def test_the_doctor_finds_this_machine_fit() -> None:
     """What the tests need, the doctor must find; a Zenoh round trip among it."""
-    cheap = [one for one in CHECKS if one[0] not in {"jax", "torch"}]
+    cheap = [one for one in CHECKS if one[0] not in {"jax", "torch", "devices"}]
     findings = [examine(name, check) for name, check in cheap]
     assert [finding.check for finding in findings] == [name for name, _ in cheap]
     assert not [finding for finding in findings if finding.verdict == "error"]
