@@ -122,18 +122,25 @@ def prepare(
         return folder, _taken_up(folder, options, algorithm)
     if options.resume:
         raise LaunchError(f"{folder}: no run to resume ({CONFIG} is missing)")
-    if folder.exists() and any(folder.iterdir()):
+    # Scenes alone are of a start that was killed before it wrote its configuration.
+    if folder.exists() and any(path.name != SCENES for path in folder.iterdir()):
         raise LaunchError(
             f"{folder}: this folder exists and is not empty; choose another"
         )
     config = resolved(options)
     (folder / SCENES).mkdir(parents=True, exist_ok=True)
-    train, held_out = prepare_banks(
-        folder / SCENES / TRAIN,
-        folder / SCENES / HELD_OUT,
-        sources=options.scenes,
-        config=config.scenes,
-    )
+    try:
+        train, held_out = prepare_banks(
+            folder / SCENES / TRAIN,
+            folder / SCENES / HELD_OUT,
+            sources=options.scenes,
+            config=config.scenes,
+        )
+    except BaseException:
+        with contextlib.suppress(OSError):  # unless there is something in them
+            (folder / SCENES).rmdir()
+            folder.rmdir()
+        raise
     if abs(train.dt - config.environment.dt) > 1e-6:
         raise LaunchError(
             f"{options.scenes[0]}: recorded in steps of {train.dt} s, the environment "

@@ -124,6 +124,18 @@ def test_a_folder_of_other_things_is_not_used(
     assert "not empty" in refusal(capsys, "train", "dqn", "--run", tmp_path)
 
 
+def test_a_run_that_could_not_begin_leaves_its_folder_free(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    wrong = ("train", "dqn", "--run", run, "--scenes", tmp_path / "wrong")
+    assert "no such file" in refusal(capsys, *wrong)
+    assert not run.exists()
+    (run / "scenes").mkdir(parents=True)  # as a kill leaves it, half-way
+    (run / "scenes" / "train.bank").write_bytes(b"half")
+    assert "no such file" in refusal(capsys, *wrong)
+
+
 def test_no_permission(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Below a file nobody can write, whoever runs the tests."""
     file = tmp_path / "file"
