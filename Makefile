@@ -40,7 +40,7 @@ test: $(STAMP)
 	$(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m "not slow" $(ARGS)
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -q -m slow $(ARGS)
+	$(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile -m slow $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .
