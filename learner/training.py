@@ -28,8 +28,8 @@ def keep_memory() -> bool:
 
     An update's tensors are freed when it ends. glibc hands those of megabytes back to
     the system and gets new pages for the next update, all zeroed and all faults:
-    20,000 of them in an update of preset `paper`, an eighth of its time. Kept, they
-    are the most that the process ever held at once.
+    17,000 to 20,000 of them in an update of preset `paper`, a tenth of whose CPU time
+    was the system's. Kept, they are the most that the process ever held at once.
     """
     try:
         set_option = ctypes.CDLL(None).mallopt
