@@ -172,7 +172,11 @@ def test_clones_drive(file, name, components, choice):
             action = jnp.asarray(dynamics.action_table(config.action))[index]
         else:
             limits = action_limits(config.action)
+            going_on = mixture.inertia(
+                jnp.hypot(now.v_x, now.v_y), config.action, config.dt
+            )
             parts = mixture.split_mixture(values[slot], len(limits))
+            parts = mixture.shifted(parts, going_on)
             scaled = {
                 "mode": lambda parts=parts: mixture.mode(parts),
                 "mean": lambda parts=parts: mixture.mean(parts),
