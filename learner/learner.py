@@ -270,7 +270,7 @@ class Drawn(Protocol):
 
 
 class LearnStep(NamedTuple):
-    """One update, and where its time went: of several in one call, an equal part."""
+    """One update, and where its time went: the first of a call has all."""
 
     result: UpdateResult
     waited_s: float  # for the replay
@@ -319,13 +319,10 @@ def learn(
         updated = time.perf_counter()
         if learner.updates % learner.config.publish_period < len(draws):
             publish(learner.updates, learner.vector())
+        spent = (waited_s, rendered - sampled, updated - rendered)
         for result in results:
-            yield LearnStep(
-                result=result,
-                waited_s=waited_s / len(draws),
-                rendered_s=(rendered - sampled) / len(draws),
-                updated_s=(updated - rendered) / len(draws),
-            )
+            yield LearnStep(result, *spent)
+            spent = (0.0, 0.0, 0.0)
         draws, waited_s = [], 0.0
 
 
