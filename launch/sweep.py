@@ -272,7 +272,7 @@ class Sweep:
             for task in (stopped, *workers):
                 task.cancel()
             await self._end_all()
-            await asyncio.gather(stopped, *workers, return_exceptions=True)
+            await asyncio.gather(stopped, finished, return_exceptions=True)
 
     async def _work(self) -> None:
         """Takes points until none waits."""

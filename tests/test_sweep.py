@@ -204,6 +204,7 @@ def test_a_person_ends_it(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     told, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130 and "the same command goes on" in told
+    assert "Traceback" not in told
     assert gone(pid)
 
 
