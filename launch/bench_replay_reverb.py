@@ -17,7 +17,6 @@ import numpy as np
 from launch.bench_replay_lines import Counts, Line, request
 
 TABLE = "replay"
-IN_FLIGHT = 16  # batches: as many as our reader has, by two queries of eight
 
 
 def main() -> None:
@@ -80,12 +79,14 @@ def reader(wanted: dict[str, Any]) -> None:
     address = f"localhost:{wanted['ports'][0]}"
     client = reverb.Client(address)
     batch = load["batch_size"]
+    # As many samples as our reader would ask for ahead; Acme's setting is two batches.
+    ahead = load["in_flight"] * load["batches_per_reply"] * batch
     dataset = reverb.TrajectoryDataset(
         server_address=address,
         table=TABLE,
         dtypes={"x": tensorflow.uint8},
         shapes={"x": tensorflow.TensorShape([load["row_bytes"]])},
-        max_in_flight_samples_per_worker=IN_FLIGHT * batch,
+        max_in_flight_samples_per_worker=ahead,
         num_workers_per_iterator=1,
     )
     samples = dataset.batch(batch, drop_remainder=True).prefetch(2)

@@ -62,8 +62,8 @@ def throughput(sizes: Sizes, peer: Contestant | None) -> Iterator[Row]:
     turns = [(contestant, several) for contestant in (*OURS, *TORCHRL)]
     if several > 1:
         turns += [(contestant, 1) for contestant in OURS]
-    if peer is not None:
-        turns.append((peer, 1))
+    if peer is not None:  # Reverb asks for as many samples ahead as ours would
+        turns += [(peer, batches) for batches in dict.fromkeys([several, 1])]
     for repetition in range(sizes.repetitions):
         for contestant, batches in turns:
             say(
