@@ -6,7 +6,7 @@ processes of a run share. Three presets:
     quick   learns to drive on two cores in minutes: a small network, few road rows, a
             progress reward (the paper's reward is satisfied by standing still), a
             higher learning rate, averaged weights; the README lists what differs
-    laptop  the same with a larger network, for 45 minutes and 2,000 scenes
+    laptop  the same with a larger network, for 20 to 30 minutes and 2,000 scenes
     paper   appendix A.2 of the Waymax paper, else Acme's: the components' defaults,
             with a network of the paper's width
 
@@ -136,7 +136,7 @@ def paper() -> ExperimentConfig:
 
 
 def laptop() -> ExperimentConfig:
-    """Double DQN within 45 minutes on two cores, on 2,000 scenes."""
+    """Double DQN in half an hour on two cores, on 2,000 scenes."""
     config = quick()
     return dataclasses.replace(
         config,
@@ -146,7 +146,7 @@ def laptop() -> ExperimentConfig:
             config.replay, capacity=500_000, samples_per_insert=2.0
         ),
         learner=dataclasses.replace(config.learner, learning_rate=3e-4),
-        budget=BudgetConfig(updates=1_000_000, minutes=40.0),
+        budget=BudgetConfig(updates=1_000_000, minutes=30.0),
         scenes=ScenesConfig(train=2000, held_out=200),
     )
 
@@ -182,7 +182,7 @@ def quick_cloning() -> ExperimentConfig:
 
 
 def laptop_cloning() -> ExperimentConfig:
-    """Cloning within 45 minutes on two cores, on 2,000 scenes."""
+    """Cloning in 20 minutes on two cores, on 2,000 scenes."""
     return dataclasses.replace(
         quick_cloning(),
         network=laptop_network(),
@@ -192,7 +192,7 @@ def laptop_cloning() -> ExperimentConfig:
             average_updates=2000,
             torch_threads=2,
         ),
-        budget=BudgetConfig(updates=1_000_000, minutes=35.0),
+        budget=BudgetConfig(updates=1_000_000, minutes=20.0),
         scenes=ScenesConfig(train=2000, held_out=200),
     )
 
