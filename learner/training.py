@@ -10,17 +10,15 @@ network and an average are one kernel each, whatever the number of layers. What 
 is by layer, as without.
 """
 
-import ctypes
 from collections.abc import Mapping
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
+from replay.allocator import MMAP_THRESHOLD, TRIM_THRESHOLD, tell_malloc
+
 Precision = Literal["float32", "bfloat16"]
-# glibc's <malloc.h>: M_MMAP_THRESHOLD and M_TRIM_THRESHOLD.
-_MMAP_THRESHOLD: Final = -3
-_TRIM_THRESHOLD: Final = -1
 
 
 def keep_memory() -> bool:
@@ -31,14 +29,8 @@ def keep_memory() -> bool:
     17,000 to 20,000 of them in an update of preset `paper`, a tenth of whose CPU time
     was the system's. Kept, they are the most that the process ever held at once.
     """
-    try:
-        set_option = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):  # another C library
-        return False
-    largest = 2**31 - 1
-    return bool(
-        set_option(_MMAP_THRESHOLD, 2**30) and set_option(_TRIM_THRESHOLD, largest)
-    )
+    kept = tell_malloc(MMAP_THRESHOLD, 2**30)
+    return tell_malloc(TRIM_THRESHOLD, 2**31 - 1) and kept
 
 
 def compute_device(name: str) -> torch.device:
