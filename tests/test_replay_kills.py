@@ -47,9 +47,14 @@ class Learner:
                 self.bad += int(sample.rows["crc"][0]) != checksum(sample.rows[0])
 
     def close(self) -> None:
-        """Ends the thread."""
+        """Ends the thread; returns when nothing that it asked for is drawn any more."""
         self._stop.set()
         self._thread.join()
+        assert eventually(self._is_answered)
+
+    def _is_answered(self) -> bool:
+        self.sampler._collect()
+        return not self.sampler._outstanding
 
 
 @contextlib.contextmanager
