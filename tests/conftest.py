@@ -13,7 +13,14 @@ install_import_hook(
 )
 
 import os  # noqa: E402
+import signal  # noqa: E402
+import threading  # noqa: E402
 from pathlib import Path  # noqa: E402
+
+# A shell's background job has Ctrl-C ignored, and so have the processes that it starts:
+# those that tests interrupt would not notice.
+if threading.current_thread() is threading.main_thread():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Many tests, and the processes that they start, compile the same programs: each is
 # compiled once. Set before JAX is imported, so that those processes have it too.

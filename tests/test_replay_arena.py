@@ -275,10 +275,12 @@ def test_a_process_of_another_container_gets_the_rows_sent() -> None:
     if subprocess.run([*namespace, "true"], capture_output=True).returncode:
         pytest.skip("this machine makes no process namespaces")
     with filled() as running:
-        for before, placed in (((), 100), (namespace, 0)):
+        # Answers to what was asked for ahead may have come too.
+        for before, placed in (((), {100, 101, 102}), (namespace, {0})):
             with reader(running.endpoint, 100, *before) as process:
                 output, _ = process.communicate(timeout=60)
-            assert output.splitlines()[-1] == f"placed {placed}"
+            word, count = output.splitlines()[-1].split()
+            assert word == "placed" and int(count) in placed
 
 
 @pytest.mark.slow
@@ -292,7 +294,7 @@ def test_readers_killed_while_they_are_answered_do_no_harm() -> None:
         sampler = Sampler(session=running.client, keys=KEYS, spec=SPEC, batch_size=8)
         for _ in range(100):
             sampler.sample(20.0)
-        assert sampler.placed == 100
+        assert 100 <= sampler.placed <= 102  # those asked for ahead may have come too
         arenas = running.server._arenas
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("replay.arena.IDLE_S", 0.2)
