@@ -24,6 +24,7 @@ user's (exit code 2), which all would share, ends the sweep.
 import asyncio
 import contextlib
 import json
+import os
 import shlex
 import shutil
 import signal
@@ -80,7 +81,7 @@ class SweepConfig:
     rotate: bool = False
     """Holds out each of the recorded scenes in turn, and trains on all others."""
     jobs: int = 1
-    """Runs at a time; each has several processes."""
+    """Runs at a time; each has several processes, and they share the cores."""
 
 
 def sweep_command(grid: str, options: SweepConfig, passed_on: Sequence[str]) -> int:
@@ -314,6 +315,7 @@ class Sweep:
         if point.algorithm == "bc":
             words += ["--space", point.space]
             words += ["--cloning.learning-rate", f"{point.learning_rate:g}"]
+            words += ["--cloning.torch-threads", str(self._threads())]
         else:
             name = point.space.removesuffix("-discrete").upper()
             words += ["--environment.action.space", name]
@@ -326,6 +328,15 @@ class Sweep:
         else:
             shutil.rmtree(folder, ignore_errors=True)  # it was killed on its first step
         return words
+
+    def _threads(self) -> int:
+        """Of a cloning learner: the preset's, unless its neighbours need the cores.
+
+        Two learners of two threads each on two cores wait for one another's threads.
+        """
+        wanted = CLONING_PRESETS[self._options.preset]().cloning.torch_threads
+        share = len(os.sched_getaffinity(0)) // self._options.jobs
+        return max(1, min(wanted, share))
 
     async def _call(self, words: list[str], name: str) -> int:
         """Runs a command to its end; its output goes to its log."""

@@ -1,6 +1,7 @@
 """The sweep: its grid, its ledger, a kill in the middle; trainings are stood in for."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -187,6 +188,9 @@ def test_runs_fail_and_the_rest_goes_on(tmp_path: Path) -> None:
     ]
     words = ran(folder)[0][2]
     assert words[-2:] == ["--budget.minutes", "1"]
+    # Two threads by the preset; two learners on two cores have one each.
+    threads = words[words.index("--cloning.torch-threads") + 1]
+    assert threads == ("1" if len(os.sched_getaffinity(0)) < 4 else "2")
     (folder / "fail").unlink()
     process = started(folder)
     process.communicate(timeout=PATIENCE_S)
