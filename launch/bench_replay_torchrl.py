@@ -4,7 +4,8 @@
 (one `extend` an insert, one `sample` and one `update_priority` a batch), behind our
 service: the same messages, limiter and client, so that only the tables differ. Its
 priorities are kept as given ((p + eps)^alpha, eps 1e-8), it draws independently, and
-its ids are slots: an update of a row that was overwritten meets the new one.
+its indices are slots, which it writes in turn: so the ids of the rows follow from them.
+An update of a row that was overwritten meets the new one.
 """
 
 from typing import Any, final
@@ -30,6 +31,8 @@ class TorchrlTable:
             priority_key="td_error",
         )
         self._row_bytes = row_bytes
+        self._capacity = capacity
+        self._drawn: list[np.ndarray] = []
         self.inserts = 0
         """Rows ever inserted."""
 
@@ -67,15 +70,28 @@ class TorchrlTable:
         batch_size: int,
         ids: UInt64[np.ndarray, " rows"],
         probabilities: Float[np.ndarray, " rows"],
-        rows: UInt8[np.ndarray, "rows row_bytes"],
     ) -> None:
-        """One `sample` a batch, copied into the reply."""
+        """One `sample` a batch, which brings the rows as well."""
+        self._drawn = []
         for start in range(0, len(ids), batch_size):
             part = slice(start, start + batch_size)
             sample = self._buffer.sample(batch_size)
-            rows[part] = sample["row"].numpy()
-            ids[part] = sample["index"].numpy()
+            self._drawn.append(sample["row"].numpy())
+            slots = sample["index"].numpy()
+            ids[part] = self.inserts - 1 - (self.inserts - 1 - slots) % self._capacity
             probabilities[part] = sample["priority_weight"].numpy()
+
+    def gather(
+        self,
+        ids: UInt64[np.ndarray, " rows"],
+        rows: UInt8[np.ndarray, "rows row_bytes"],
+    ) -> None:
+        """What was drawn, copied into the reply; of a part of it, from the storage."""
+        if len(ids) == sum(map(len, self._drawn)):
+            np.concatenate(self._drawn, out=rows)
+            return
+        slots = torch.from_numpy((ids % np.uint64(self._capacity)).astype(np.int64))
+        rows[:] = self._buffer[slots]["row"].numpy()
 
     def update_priorities(
         self,
@@ -84,8 +100,9 @@ class TorchrlTable:
     ) -> int:
         """One `update_priority`; none is known to be stale."""
         if len(ids):
+            slots = (ids.astype(np.uint64) % np.uint64(self._capacity)).astype(np.int64)
             self._buffer.update_priority(
-                torch.from_numpy(ids.astype(np.int64)),
+                torch.from_numpy(slots),
                 torch.from_numpy(priorities.astype(np.float32)),
             )
         return 0

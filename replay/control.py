@@ -87,6 +87,7 @@ class StreamOffer(Message, frozen=True, kw_only=True, tag=True):
 
     ports: dict[str, Annotated[int, msgspec.Meta(ge=1, le=65535)]]  # by numeric host
     token: Annotated[bytes, msgspec.Meta(min_length=16, max_length=16)]
+    capacity: Count  # of the table: a sampler may keep as many rows (`replay.mirror`)
 
 
 @final

@@ -13,6 +13,7 @@ from jaxtyping import Float, Integer, UInt8
 
 from replay.limiter import LimiterError, RateLimiter
 from replay.mapped import MappedStorage, open_storage
+from replay.mirror import SentRows
 from replay.selectors import SamplerName
 from replay.spec import ReplayError, RowSpec, Sample
 from replay.storage import AbstractStorage, MemoryStorage, WriterMark
@@ -220,8 +221,12 @@ class LocalReplay:
         batches: int,
         payload: bytearray | None = None,
         place: memoryview | None = None,
+        sent: SentRows | None = None,
     ) -> SampleReplyBuffer:
-        """Several batches, gathered straight into a reply (see `SampleReplyBuffer`)."""
+        """Several batches, gathered straight into a reply (see `SampleReplyBuffer`).
+
+        Without the rows that have been `sent`.
+        """
         count = batch_size * batches
         if not self.may_sample(count):
             raise LimiterError(f"{count} samples before more is inserted")
@@ -232,8 +237,12 @@ class LocalReplay:
             batch_size=batch_size,
             ids=buffer.ids,
             probabilities=buffer.probabilities,
-            rows=buffer.rows,
         )
+        wanted = buffer.ids
+        if sent is not None:
+            wanted = wanted[sent.unsent(wanted, self.inserts)]
+            buffer.leave_out(count - len(wanted))
+        self.table.gather(wanted, buffer.rows)
         self.samples += count
         self._storage.count_samples(self.samples)
         return buffer

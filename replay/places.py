@@ -29,7 +29,7 @@ class MemoryPlace:
 @final
 @dataclass(frozen=True, kw_only=True)
 class StreamPlace:
-    """By which connection a body is to come, and as which: `replay.streams`."""
+    """By which connection a body is to come, and as which: `replay.stream_frames`."""
 
     name: bytes  # the connection's
     number: int

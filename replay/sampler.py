@@ -13,11 +13,12 @@ import zenoh
 from jaxtyping import Float, Integer
 
 from replay.arena import Arena, make_arena
+from replay.body_stream import BodyStream
 from replay.keys import RunKeys
 from replay.places import Place
 from replay.session import direct, shares_memory
 from replay.spec import ReplayError, ReplayTimeout, RowSpec, Sample
-from replay.streams import LEAST_BYTES, BodyStream
+from replay.stream_frames import LEAST_BYTES
 from replay.wire import (
     SampleReply,
     SampleRequest,
@@ -120,7 +121,7 @@ class Sampler:
         `on_answer` is called on Zenoh's thread when a query has ended.
         A service on this machine puts the rows into this process's memory
         (`replay.arena`) if the session was opened with shared memory; from elsewhere,
-        large answers come by a stream (`replay.streams`).
+        large answers come by a stream (`replay.stream_frames`).
         """
         if min(batch_size, batches_per_reply, in_flight) < 1:
             raise ReplayError(
@@ -247,7 +248,12 @@ class Sampler:
         now = time.monotonic()
         if (self._stream is None or self._stream.is_closed) and now >= self._stream_due:
             self._stream_due = now + _STREAM_RETRY_S
-            self._stream = BodyStream(session=self._session, keys=self._keys)
+            self._stream = BodyStream(
+                session=self._session,
+                keys=self._keys,
+                spec=self._spec,
+                count=self._batch_size * self._batches,
+            )
             weakref.finalize(self, self._stream.close)
         return None
 

@@ -96,7 +96,7 @@ class ReplayServer:
             check_rows=lambda rows: self._check_batches(insert_rows=rows),
             part=self._arenas.part,
         )
-        self._streams = ReplyStreams()
+        self._streams = ReplyStreams(capacity=config.capacity)
         # The last reply's: Zenoh has copied it, and fresh pages cost a fault each.
         self._payload = bytearray()
         self._hub = hub
@@ -194,17 +194,19 @@ class ReplayServer:
         held = self._samples.popleft()
         place = held.message.place
         body = self._body_at(place, body_bytes(self._spec, held.count))
+        stream = place if body and isinstance(place, StreamPlace) else None
         buffer = self._replay.sample_into_buffer(
             batch_size=held.message.batch_size,
             batches=held.message.batches,
             payload=self._payload,
             place=body,
+            sent=self._streams.sent(stream) if stream else None,
         )
         self._payload = buffer.payload
         self._counters.sample_wait_s += time.monotonic() - held.arrived
         answer(held.query, self._sealed(buffer))
-        if body is not None and isinstance(place, StreamPlace):
-            self._streams.put(place, body)
+        if stream and body:
+            self._streams.put(stream, body[: buffer.body_bytes])
         return True
 
     def _body_at(self, place: Place | None, length: int) -> memoryview | None:

@@ -11,7 +11,7 @@ Settings that were measured to matter:
   instead of 1.5 s;
 - Zenoh's own shared memory is off: a process that is killed leaves its pool of 16 MB
   behind for as long as the service lives, and large batches of rows go by
-  `replay.arena` or `replay.streams`, with less CPU time;
+  `replay.arena` or `replay.stream_frames`, with less CPU time;
 - room for 16 batches of 64 KB to be sent per link instead of 2: whoever answers with
   512 KB does not wait for the socket seven times. A draw of 64 rows of 8 KB by TCP
   takes a quarter less CPU time;

@@ -175,9 +175,11 @@ class Table:
         batch_size: int,
         ids: UInt64[np.ndarray, " rows"],
         probabilities: Float[np.ndarray, " rows"],
-        rows: UInt8[np.ndarray, "rows row_bytes"],
     ) -> None:
-        """Fills the given arrays with whole batches, each stratified by itself."""
+        """Fills the given arrays with whole batches, each stratified by itself.
+
+        The rows are had by `gather`, before anything else is inserted.
+        """
         count = len(ids)
         if self.size == 0 or count % batch_size or not self._can_draw(count):
             raise ReplayError(
@@ -196,6 +198,14 @@ class Table:
             positions = (strata - self._random.random(count)) / batch_size
             slots, probabilities[:] = self._selector.draw(positions, self._window)
         ids[:] = self._ids_of(slots)
+
+    def gather(
+        self,
+        ids: UInt64[np.ndarray, " rows"],
+        rows: UInt8[np.ndarray, "rows row_bytes"],
+    ) -> None:
+        """Copies the rows of ids that have just been drawn."""
+        slots = (ids % np.uint64(self.capacity)).astype(np.int64)
         # "clip" because "raise" makes NumPy gather into a buffer of its own first.
         np.take(self._rows, slots, axis=0, out=rows, mode="clip")
 

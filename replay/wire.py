@@ -200,6 +200,15 @@ class SampleReplyBuffer:
         rows = np.frombuffer(body, np.uint8, count * spec.row_bytes, 16 * count)
         self.rows = rows.reshape(count, spec.row_bytes)
 
+    def leave_out(self, rows: int) -> None:
+        """The last rows' bytes do not go with it: whoever asked has them."""
+        self.rows = self.rows[: len(self.rows) - rows]
+
+    @property
+    def body_bytes(self) -> int:
+        """Bytes of ids, probabilities and the rows that go with them."""
+        return self.ids.nbytes + self.probabilities.nbytes + self.rows.nbytes
+
     def seal(self, *, size: int, inserts: int, mass: float) -> bytearray:
         """Writes the header and returns the whole message."""
         head = _SAMPLE_REPLY.pack(

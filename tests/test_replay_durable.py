@@ -57,7 +57,6 @@ def draw(table: Table, count: int) -> None:
         batch_size=count,
         ids=np.zeros(count, np.uint64),
         probabilities=np.zeros(count),
-        rows=np.zeros((count, SPEC.row_bytes), np.uint8),
     )
 
 

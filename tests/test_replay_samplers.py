@@ -36,7 +36,8 @@ def insert(table: Table, count: int) -> None:
 def draw(table: Table, count: int) -> tuple[list[int], np.ndarray]:
     ids, chances = np.zeros(count, np.uint64), np.zeros(count)
     rows = np.zeros((count, SPEC.row_bytes), np.uint8)
-    table.draw(batch_size=count, ids=ids, probabilities=chances, rows=rows)
+    table.draw(batch_size=count, ids=ids, probabilities=chances)
+    table.gather(ids, rows)
     numbers = rows.reshape(-1).view(SPEC.dtype)["number"]
     np.testing.assert_array_equal(numbers, ids)
     return ids.tolist(), chances

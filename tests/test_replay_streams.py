@@ -2,11 +2,8 @@
 
 import contextlib
 import socket
-import struct
-import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,12 +12,13 @@ import zenoh
 from replay import streams
 from replay.arena import Arena
 from replay.client import Sampler, Writer, fetch_rows, fetch_stats
-from replay.control import StreamOffer, decode, encode
+from replay.control import StreamOffer, decode
 from replay.local import ReplayConfig
 from replay.places import MemoryPlace, StreamPlace
-from replay.session import ask, direct, open_session
-from replay.spec import Field, RowSpec
-from replay.streams import BodyStream, ReplyStreams
+from replay.session import ask, open_session
+from replay.spec import Field, ReplayTimeout, RowSpec
+from replay.stream_frames import hosts
+from replay.streams import ReplyStreams
 from replay.wire import Status
 from replay.wire_inserts import Insert, InsertReply
 from tests.replay_parts import KEYS, Service, eventually, service
@@ -60,9 +58,11 @@ def fill(running: Service, session: zenoh.Session) -> Writer:
 
 
 @contextlib.contextmanager
-def apart() -> Iterator[tuple[Service, zenoh.Session]]:
+def apart(
+    config: ReplayConfig = FREE,
+) -> Iterator[tuple[Service, zenoh.Session]]:
     """A full service, and a session that shares no memory with it."""
-    with service(FREE, spec=LARGE) as running:
+    with service(config, spec=LARGE) as running:
         fill(running, running.client)
         session = open_session(connect=[running.endpoint], shared_memory=False)
         try:
@@ -112,6 +112,58 @@ def test_priorities_ride_with_streamed_answers_too() -> None:
         assert eventually(lambda: (sampler.sample(20.0).ids == 7).all())
 
 
+def test_an_answer_waits_for_its_body() -> None:
+    """Its header comes first, by another way."""
+    with apart() as (running, session):
+        sampler, streams_ = sampler_of(session), running.server._streams
+        draw_until_streamed(sampler, 1)
+        put, held = streams_.put, []
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(streams_, "put", lambda *sent: held.append(sent))
+            with pytest.raises(ReplayTimeout):
+                for _ in range(10):  # more than were on their way
+                    assert are_whole(sampler.sample(1.0).rows)
+        assert len(held) == 2
+        before = sampler.streamed
+        for sent in held:
+            put(*sent)
+        draw_until_streamed(sampler, before + 2)
+
+
+def test_memory_that_an_answer_did_not_need_is_used_again() -> None:
+    with apart() as (running, session):
+        sampler, streams_ = sampler_of(session), running.server._streams
+        draw_until_streamed(sampler, 1)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(streams_, "room", lambda *_: None)
+            for _ in range(20):  # more than there are parts
+                assert are_whole(sampler.sample(20.0).rows)
+        draw_until_streamed(sampler, sampler.streamed + 5)
+
+
+def test_a_stream_brings_each_row_once_and_those_that_replace_it() -> None:
+    with apart(replace(FREE, capacity=ROWS)) as (running, session):
+        sampler = sampler_of(session)
+        draw_until_streamed(sampler, 40)
+        assert sampler._stream is not None
+        assert ROWS * 0.9 < sampler._stream.kept <= ROWS
+        later = Writer(session=running.client, keys=KEYS, spec=LARGE, writer=0, epoch=2)
+        later.append(large_rows(ROWS, ROWS))  # all that were there are gone
+        assert later.close(20.0)
+        draw_until_streamed(sampler, sampler.streamed + 40)
+        assert ROWS * 1.9 < sampler._stream.kept <= 2 * ROWS
+
+
+def test_a_table_too_large_to_be_kept_is_sent_as_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("replay.mirror.MAX_MIRROR_BYTES", 1 << 20)
+    with apart() as (_, session):
+        sampler = sampler_of(session)
+        draw_until_streamed(sampler, 20)
+        assert sampler._stream is not None and sampler._stream.kept == 0
+
+
 def test_a_broken_stream_costs_no_batch_and_is_made_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -133,7 +185,7 @@ def test_without_a_stream_whole_answers_come_by_zenoh(
         raise ConnectionRefusedError
 
     with apart() as (_, session):
-        monkeypatch.setattr("replay.streams.socket.create_connection", refuse)
+        monkeypatch.setattr("replay.body_stream.socket.create_connection", refuse)
         sampler = sampler_of(session)
         for _ in range(30):
             assert are_whole(sampler.sample(20.0).rows)
@@ -169,8 +221,8 @@ def test_a_wrong_greeting_is_turned_away(
 ) -> None:
     running, address, token = offered
     greeting = {
-        "magic": b"GET / HT" + token + bytes(16),
-        "token": b"SLSTREAM" + bytes(32),
+        "magic": b"GET / HT" + token + bytes(17),
+        "token": b"SLSTREAM" + bytes(33),
         "short": b"SLSTREAM",
     }[wrong]
     with socket.create_connection(address, 10.0) as connection:
@@ -190,7 +242,7 @@ def test_whoever_says_nothing_is_turned_away(
         socket.create_connection(address, 10.0) as silent,
         socket.create_connection(address, 10.0) as prompt,
     ):
-        prompt.sendall(b"SLSTREAM" + token + bytes(16))
+        prompt.sendall(b"SLSTREAM" + token + bytes(17))
         assert prompt.recv(1) == b"\x01"  # the silent one keeps nobody waiting
         assert silent.recv(1) == b""
 
@@ -202,14 +254,14 @@ def test_connections_are_limited(
     with contextlib.ExitStack() as stack:
         for number in range(streams._MAX_CONNECTIONS):
             connection = stack.enter_context(socket.create_connection(address, 10.0))
-            connection.sendall(b"SLSTREAM" + token + number.to_bytes(16, "big"))
+            connection.sendall(b"SLSTREAM" + token + number.to_bytes(16, "big") + b"\0")
             assert connection.recv(1) == b"\x01"
         late = stack.enter_context(socket.create_connection(address, 10.0))
         with contextlib.suppress(ConnectionResetError):
             assert late.recv(1) == b""
     assert eventually(lambda: len(running.server._streams) == 0)
     with socket.create_connection(address, 10.0) as again:
-        again.sendall(b"SLSTREAM" + token + bytes(16))
+        again.sendall(b"SLSTREAM" + token + bytes(17))
         assert again.recv(1) == b"\x01"
 
 
@@ -226,110 +278,40 @@ def test_a_listener_that_failed_is_replaced(
 
     assert eventually(lambda: offer().ports.get(host, port) != port)
     with socket.create_connection((host, offer().ports[host]), 10.0) as again:
-        again.sendall(b"SLSTREAM" + token + bytes(16))
+        again.sendall(b"SLSTREAM" + token + bytes(17))
         assert again.recv(1) == b"\x01"
 
 
+@pytest.mark.parametrize("most", [streams._MAX_HELD, 3])
 def test_who_does_not_read_is_answered_by_zenoh(
+    most: int,
     offered: tuple[Service, tuple[str, int], bytes],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Not more is held for a connection than it may have."""
+    """No more is held for a connection than it may have, in number and in bytes."""
+    size = 8 << 20
+    if most < streams._MAX_HELD:
+        monkeypatch.setattr("replay.streams._MAX_HELD_BYTES", most * size)
     running, address, token = offered
     outgoing: ReplyStreams = running.server._streams
     place = StreamPlace(name=bytes(16), number=0)
     with socket.create_connection(address, 10.0) as connection:
-        connection.sendall(b"SLSTREAM" + token + bytes(16))
+        connection.sendall(b"SLSTREAM" + token + bytes(17))
         assert connection.recv(1) == b"\x01"
         assert eventually(lambda: len(outgoing) == 1)
         held = 0
-        while (room := outgoing.room(place, 8 << 20)) is not None:
+        while (room := outgoing.room(place, size)) is not None and held < 100:
             outgoing.put(place, room)
             held += 1
-            assert held < 100
-        # One is on its way besides, and the kernel may take several.
-        assert held >= streams._MAX_HELD
+        # One is on its way besides, and the kernel may have taken another.
+        assert most <= held <= most + 2
     assert eventually(lambda: len(outgoing) == 0)
-    assert outgoing.room(place, 8 << 20) is None
+    assert outgoing.room(place, size) is None
 
 
 def test_there_is_no_stream_beside_encrypted_links() -> None:
     links = ["tls/10.0.0.1:7447", "quic/10.0.0.2:7447", "tcp/10.0.0.3:7447"]
-    assert streams._hosts([*links, "tcp/[fe80::1]:7447"]) == {"10.0.0.3", "fe80::1"}
-
-
-# What the sampler's stream believes
-
-
-@dataclass
-class Fake:
-    """A service of which the test is the other end."""
-
-    stream: BodyStream
-    connection: socket.socket
-
-
-@contextlib.contextmanager
-def fake() -> Iterator[Fake]:
-    """A stream to a listener of the test."""
-    with (
-        socket.create_server(("127.0.0.1", 0)) as listener,
-        service(FREE, spec=LARGE) as running,
-        open_session(connect=[running.endpoint]) as session,
-    ):
-        ports = {"127.0.0.1": listener.getsockname()[1]}
-        offer = encode(StreamOffer(ports=ports, token=bytes(16)))
-        keys = replace(KEYS, run_id="fake")
-
-        def answer(query: Any) -> None:
-            with query:
-                query.reply(query.key_expr, offer)
-
-        queryable = session.declare_queryable(keys.stream, direct(answer))
-        stream = BodyStream(session=session, keys=keys)
-        connection, _ = listener.accept()
-        with connection:
-            assert connection.recv(40, socket.MSG_WAITALL)[:8] == b"SLSTREAM"
-            connection.sendall(b"\x01")
-            assert eventually(lambda: stream.is_open)
-            yield Fake(stream, connection)
-        stream.close()
-        queryable.undeclare()
-
-
-def test_bodies_are_received_where_they_belong_and_others_dropped() -> None:
-    with fake() as peer:
-        rooms = [bytearray(5) for _ in range(2)]
-        ends: list[tuple[int, bool]] = []
-        ended = threading.Event()
-        for number, room in enumerate(rooms):
-
-            def on_end(is_whole: bool, number: int = number) -> None:
-                ends.append((number, is_whole))
-                ended.set()
-
-            assert peer.stream.expect(number, memoryview(room), on_end) is not None
-        peer.stream.forget(0)
-        for number, body in ((0, b"early"), (9, bytes(700_000)), (1, b"right")):
-            peer.connection.sendall(struct.pack("<QQ", number, len(body)) + body)
-        assert ended.wait(20.0) and ends == [(1, True)]
-        assert rooms == [bytearray(5), bytearray(b"right")]
-
-
-@pytest.mark.parametrize("fault", ["length", "cut", "gone"])
-def test_a_body_that_does_not_come_whole_ends_the_stream(fault: str) -> None:
-    with fake() as peer:
-        ends: list[bool] = []
-        place = peer.stream.expect(3, memoryview(bytearray(8)), ends.append)
-        assert place is not None and place.number == 3
-        if fault == "length":
-            peer.connection.sendall(struct.pack("<QQ", 3, 2**62) + bytes(8))
-        elif fault == "cut":
-            peer.connection.sendall(struct.pack("<QQ", 3, 8) + bytes(3))
-        if fault != "length":
-            peer.connection.shutdown(socket.SHUT_RDWR)
-        assert eventually(lambda: peer.stream.is_closed and ends == [False])
-        assert peer.stream.expect(4, memoryview(bytearray(8)), ends.append) is None
-        assert ends == [False]
+    assert hosts([*links, "tcp/[fe80::1]:7447"]) == {"10.0.0.3", "fe80::1"}
 
 
 # Inserting

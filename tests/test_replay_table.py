@@ -24,7 +24,8 @@ def draw(table: Table, batch_size: int, batches: int = 1) -> Sample:
     count = batch_size * batches
     ids, probabilities = np.zeros(count, np.uint64), np.zeros(count)
     rows = np.zeros((count, SPEC.row_bytes), np.uint8)
-    table.draw(batch_size=batch_size, ids=ids, probabilities=probabilities, rows=rows)
+    table.draw(batch_size=batch_size, ids=ids, probabilities=probabilities)
+    table.gather(ids, rows)
     return Sample(
         ids=ids,
         probabilities=probabilities,

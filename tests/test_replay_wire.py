@@ -111,7 +111,7 @@ PAYLOADS: dict[str, tuple[bytes, Decoder, bool]] = {
     "Weights": (weights().encode(), Weights.decode, True),
 }
 SMALL_MESSAGES: list[control.Message] = [
-    control.StreamOffer(ports={"127.0.0.1": 65535}, token=bytes(16)),
+    control.StreamOffer(ports={"127.0.0.1": 65535}, token=bytes(16), capacity=9),
     control.StatusMessage(role="actor-1", values={"steps": 3, "rate": 0.5, "x": "y"}),
     control.Stop(reason="learnt"),
     control.FileRequest(offset=5, length=7),
