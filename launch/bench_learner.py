@@ -1,7 +1,8 @@
 """`slipstream bench learner`: updates per second, against plain eager loops.
 
 With the same weights, arrays and number of threads, the contestants take turns: ours in
-float32, ours in bfloat16, and two plain loops (`launch.bench_learner_peers`), one with
+float32, with the next state's values in bfloat16 (double DQN), and all in bfloat16, and
+two plain loops (`launch.bench_learner_peers`), one with
 the network in plain form and one with the network in our form. A repetition is one turn
 of each, of at least `SAMPLE_S`; a figure is the median over the repetitions, a ratio
 the median of each repetition's. On one thread the clock is the process's own CPU time,
@@ -22,7 +23,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -52,7 +53,7 @@ from sim.observation import Observation, ObservationSizes, observation_sizes
 
 SAMPLE_S: Final = 0.3
 VALID: Final = 0.8  # of the rows of a random observation
-PRECISIONS: Final[tuple[Precision, ...]] = ("float32", "bfloat16")
+PRECISIONS: Final[tuple[Precision, ...]] = get_args(Precision)
 PEERS: Final = ("plain", "plain loop")
 Algorithm = Literal["dqn", "bc"]
 Row = dict[str, Any]
@@ -144,7 +145,9 @@ def bc_batch(preset: ExperimentConfig) -> CloningBatch:
 
 
 def bc_learner(
-    preset: ExperimentConfig, threads: int, precision: Precision = "float32"
+    preset: ExperimentConfig,
+    threads: int,
+    precision: Literal["float32", "bfloat16"] = "float32",
 ) -> CloningLearner:
     """Cloning with the paper's settings and the preset's network."""
     return CloningLearner(
@@ -169,10 +172,12 @@ def our_turns(
             turns[precision] = functools.partial(ours.update, batch)
             network, seen = ours.network, batch.observation_tm1
             alone = [ours.network, ours.target]
-        else:
+        elif precision != "bfloat16-targets":  # cloning has none
             taken, other = bc_batch(preset), bc_learner(preset, threads, precision)
             turns[precision] = functools.partial(other.update, taken)
             network, seen = other.network, taken.observation_tm1
+        else:
+            continue
         turns[f"{precision} network"] = _passes(network, seen, precision, alone)
     return turns
 
@@ -209,9 +214,9 @@ def _passes(
     def turn() -> object:
         with in_precision(precision, device):
             outputs = network(*tensors).float()
-            with torch.no_grad():
-                for other in without_gradient:
-                    other(*tensors)
+        with torch.no_grad(), in_precision(precision, device, learns=False):
+            for other in without_gradient:
+                other(*tensors)
         return torch.autograd.grad(outputs, list(network.parameters()), seed)
 
     return turn
@@ -227,7 +232,7 @@ def measured(contestants: Mapping[str, Lasted], *, repetitions: int) -> Row:
     row: Row = {"calls": calls}
     for name in PEERS:
         row[name] = {"updates_per_s": 1 / statistics.median(spent[name])}
-    for name in PRECISIONS:
+    for name in [name for name in PRECISIONS if name in spent]:
         passes = zip(spent[f"{name} network"], spent[name], strict=True)
         row[name] = {
             "updates_per_s": 1 / statistics.median(spent[name]),
@@ -292,19 +297,19 @@ def _rows(options: BenchLearnerConfig) -> list[Row]:
 
 
 def _table(rows: list[Row]) -> Table:
-    table = Table("", "threads", "plain/s", "its loop/s")
-    for name in PRECISIONS:
-        for column in (f"{name}/s", "x", "x loop", "other"):
-            table.add_column(column)
+    heads = ("updates", "learner", "updates/s", "x plain", "x its loop", "other")
+    table = Table(*heads, caption="x1: threads")
     for row in rows:
-        cells = [f"{row['preset']} {row['algorithm']}", str(row["threads"])]
-        cells += [f"{row[name]['updates_per_s']:.2f}" for name in PEERS]
-        for name in PRECISIONS:
+        about = f"{row['preset']} {row['algorithm']} x{row['threads']}"
+        for name in PEERS:
+            rate = f"{row[name]['updates_per_s']:.2f}"
+            table.add_row(about, f"[dim]{name}", rate, "", "", "")
+        for name in [name for name in PRECISIONS if name in row]:
             own = row[name]
-            cells.append(f"{own['updates_per_s']:.2f}")
-            cells += [f"{own[f'over {peer}']:.2f}" for peer in PEERS]
-            cells.append(f"{own['other_share']:.0%}")
-        table.add_row(*cells)
+            rate = f"{own['updates_per_s']:.2f}"
+            ratios = [f"{own[f'over {peer}']:.2f}" for peer in PEERS]
+            table.add_row(about, name, rate, *ratios, f"{own['other_share']:.0%}")
+        table.add_section()
     return table
 
 
@@ -318,8 +323,8 @@ def _plot(rows: list[Row], folder: Path) -> None:
     figure, axes = pyplot.subplots(figsize=(8, 0.5 * len(rows) + 1.5))
     places = np.arange(len(rows))
     for index, name in enumerate(PRECISIONS):
-        ratios = [row[name]["over plain"] for row in rows]
-        axes.barh(places + 0.4 * index - 0.2, ratios, 0.38, label=name)
+        ratios = [row.get(name, {}).get("over plain", 0.0) for row in rows]
+        axes.barh(places + 0.27 * (index - 1), ratios, 0.25, label=name)
     axes.axvline(1, color="black", linewidth=0.8)
     axes.set_yticks(
         places,

@@ -66,8 +66,10 @@ class LearnerConfig:
     torch_threads: int = 1
     """Threads of torch in the learner's process."""
 
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Of the network's matrix products; weights and losses are float32 either way."""
+    precision: Literal["float32", "bfloat16-targets", "bfloat16"] = "float32"
+    """Of the network's matrix products; weights and losses are float32 either way.
+    bfloat16-targets: only of the values of the next state, of which no gradient is
+    taken; what is learnt from them is computed in float32."""
 
     device: str = "cpu"
     """Where torch computes: cpu, cuda, cuda:1, ..., or auto: CUDA where there is."""

@@ -233,9 +233,12 @@ class Learner:
         # backward runs over both halves and made an update 35% slower.
         with in_precision(self.config.precision, self._device):
             q_tm1 = self.network(*inputs.tm1)
-            with torch.no_grad():
-                q_online_t = self.network(*inputs.t)
-                q_target_t = self.target(*inputs.t)
+        with (
+            torch.no_grad(),
+            in_precision(self.config.precision, self._device, learns=False),
+        ):
+            q_online_t = self.network(*inputs.t)
+            q_target_t = self.target(*inputs.t)
         clip = self.config.reward_clip
         return QBatch(
             q_tm1=q_tm1.float(),

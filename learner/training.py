@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from replay.allocator import MMAP_THRESHOLD, TRIM_THRESHOLD, tell_malloc
 
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "bfloat16-targets", "bfloat16"]
 
 
 def keep_memory() -> bool:
@@ -87,11 +87,15 @@ def vector_of(optimiser: torch.optim.Adam) -> nn.Parameter:
     return vector
 
 
-def in_precision(precision: Precision, device: torch.device) -> torch.autocast:
-    """The context in which a network's forward pass computes so."""
-    return torch.autocast(
-        device.type, dtype=torch.bfloat16, enabled=precision == "bfloat16"
-    )
+def in_precision(
+    precision: Precision, device: torch.device, *, learns: bool = True
+) -> torch.autocast:
+    """The context in which a network's forward pass computes so.
+
+    `learns`: the pass is one that a gradient is taken of.
+    """
+    least = precision == "bfloat16" or (not learns and precision == "bfloat16-targets")
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=least)
 
 
 def step_down(

@@ -247,8 +247,9 @@ def test_the_policy_is_the_mean_of_the_weights_where_that_is_asked_for(
     assert (learner.policy_vector() != learner.vector()).any() == (average_updates > 0)
 
 
-def test_bfloat16_learns_nearly_the_same_and_keeps_float32_weights():
-    exact, fast = make_learner(), make_learner(precision="bfloat16")
+@pytest.mark.parametrize("precision", ["bfloat16-targets", "bfloat16"])
+def test_bfloat16_learns_nearly_the_same_and_keeps_float32_weights(precision):
+    exact, fast = make_learner(), make_learner(precision=precision)
     ours, theirs = losses_of(exact, 20), losses_of(fast, 20)
     assert ours != theirs
     np.testing.assert_allclose(ours, theirs, rtol=0.05)
@@ -256,6 +257,16 @@ def test_bfloat16_learns_nearly_the_same_and_keeps_float32_weights():
     assert {m["exp_avg"].dtype for m in fast.optimiser.state.values()} == {
         torch.float32
     }
+
+
+def test_values_that_are_learnt_stay_float32_when_targets_are_not():
+    exact, mixed, fast = (
+        make_learner(precision=precision)
+        for precision in ("float32", "bfloat16-targets", "bfloat16")
+    )
+    batch = next(make_batches())
+    taken = [learner.update(batch).mean_q for learner in (exact, mixed, fast)]
+    assert taken[0] == taken[1] != taken[2]
 
 
 def test_auto_is_the_device_at_hand_and_a_missing_one_is_refused(monkeypatch):
