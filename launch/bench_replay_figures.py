@@ -100,7 +100,7 @@ def scale_figure(rows: Sequence[Row]) -> Figure:
         axes.set_xscale("log", base=2)
         axes.set_ylim(bottom=0)
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
         axes.set_xlabel("writers")
         axes.set_ylabel(label)
         axes.grid(visible=True, alpha=0.35)

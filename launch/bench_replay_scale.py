@@ -29,9 +29,9 @@ def scale(sizes: Sizes, peer: Contestant | None) -> Iterator[Row]:
     load = sizes.workload(row_bytes=ROW_BYTES)
     best = 0.0
     for shards in sizes.shards:
-        for writers in sizes.writers:
-            # A shard without a writer would never fill.
-            crew = Crew(shards=shards, writers=max(writers, shards))
+        # A shard without a writer would never fill.
+        for writers in dict.fromkeys(max(count, shards) for count in sizes.writers):
+            crew = Crew(shards=shards, writers=writers)
             say(f"scale: {shards} shards, {crew.writers} writers")
             found = measure(OURS[1], load, crew, seconds=seconds)
             best = max(best, found["samples_per_s"]) if shards == 1 else best
