@@ -109,6 +109,7 @@ class BodyStream:
             pass  # answers come by Zenoh then
         finally:
             self._closed = True
+            self._mirror = None  # the next connection begins with nothing
             while self._expected:
                 _, (_, on_end) = self._expected.popitem()
                 on_end(False)

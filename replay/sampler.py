@@ -142,6 +142,7 @@ class Sampler:
         self._placed = self._streamed = self._asked = 0
         self._stream: BodyStream | None = None
         self._stream_due = 0.0  # time.monotonic
+        self._let_go: Callable[[], object] = lambda: None  # of the last stream
         self._body_bytes = body_bytes(spec, batch_size * batches_per_reply)
         self._events: queue.SimpleQueue[tuple[_Request, zenoh.ZBytes | None]]
         self._events = queue.SimpleQueue()
@@ -254,7 +255,8 @@ class Sampler:
                 spec=self._spec,
                 count=self._batch_size * self._batches,
             )
-            weakref.finalize(self, self._stream.close)
+            self._let_go()
+            self._let_go = weakref.finalize(self, self._stream.close)
         return None
 
     def _open_arena(self) -> Arena | None:

@@ -92,6 +92,8 @@ def test_lacking_rows_are_kept_also_from_bodies_that_nobody_expects() -> None:
             peer.connection.sendall(struct.pack("<QQ", number, len(sent)) + sent)
         assert eventually(lambda: ends == [True]) and peer.stream.kept == 3
         assert bytes(room) == body([2, 1], [12, 11])
+        peer.connection.shutdown(socket.SHUT_RDWR)
+        assert eventually(lambda: peer.stream.is_closed and peer.stream.kept == 0)
 
 
 @pytest.mark.parametrize("wrong", ["missing", "odd", "short", "long"])
