@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path
+from types import FrameType
 from typing import NamedTuple
 
 from sim.parts import Part, is_whole, part_of, read_part, write_failure, write_part
@@ -228,14 +229,24 @@ def _submitted(
 
     The terminal sends that to all processes, and each would print a traceback; the
     caller's ends them. Blocked and not ignored, as no Ctrl-C must be lost meanwhile.
+    Other threads may still take it, whereupon Python interrupts the main one: half
+    started, a process would complain, so it is put off until it has been started.
     """
     if threading.current_thread() is not threading.main_thread():
         return pool.submit(_convert, place, conversion)
+    handler = signal.getsignal(signal.SIGINT)
+    came: list[tuple[int, FrameType | None]] = []
+    if callable(handler):
+        signal.signal(signal.SIGINT, lambda *told: came.append(told))
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         return pool.submit(_convert, place, conversion)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if callable(handler):
+            signal.signal(signal.SIGINT, handler)
+            for told in came[:1]:
+                handler(*told)
 
 
 @contextmanager

@@ -7,7 +7,9 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import final
 
@@ -17,7 +19,14 @@ import pytest
 from launch.main import main
 from sim.bank import open_bank, verify
 from sim.bank_writer import write_bank
-from sim.conversion import Conversion, Outcome, converted, work_folder, working_in
+from sim.conversion import (
+    Conversion,
+    Outcome,
+    _submitted,
+    converted,
+    work_folder,
+    working_in,
+)
 from sim.formats import list_files, read_scenes
 from sim.parts import Part
 from sim.places import AbstractPlace, places_in, procedural_places
@@ -362,3 +371,28 @@ def test_a_scene_that_kills_its_process_is_told(tmp_path: Path) -> None:
     many = [*places, *(Poison() for _ in range(3))]
     with pytest.raises(SceneError, match="poison: the process"):
         list(converted(many, conversion))
+
+
+def test_ctrl_c_waits_until_a_process_has_been_started(tmp_path: Path) -> None:
+    """Another thread takes the signal; half started, a process would complain."""
+    ended, started = threading.Event(), []
+
+    class Starting(ProcessPoolExecutor):
+        def submit(self, *_: object) -> object:
+            os.kill(os.getpid(), signal.SIGINT)
+            for _ in range(1000):  # where Python would interrupt
+                pass
+            started.append(True)
+            return Future()
+
+    thread = threading.Thread(target=ended.wait)
+    thread.start()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with Starting(1) as pool, pytest.raises(KeyboardInterrupt):
+            _submitted(pool, SceneError("none"), Conversion(folder=tmp_path))
+        assert started and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+        ended.set()
+        thread.join()
