@@ -5,6 +5,7 @@ import json
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -380,19 +381,24 @@ def test_ctrl_c_waits_until_a_process_has_been_started(tmp_path: Path) -> None:
     class Starting(ProcessPoolExecutor):
         def submit(self, *_: object) -> object:
             os.kill(os.getpid(), signal.SIGINT)
-            for _ in range(1000):  # where Python would interrupt
-                pass
+            woken.recv(1)  # it has come
             started.append(True)
             return Future()
 
     thread = threading.Thread(target=ended.wait)
     thread.start()
+    woken, waking = socket.socketpair()
+    waking.setblocking(False)
+    signal.set_wakeup_fd(waking.fileno())
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with Starting(1) as pool, pytest.raises(KeyboardInterrupt):
             _submitted(pool, SceneError("none"), Conversion(folder=tmp_path))
         assert started and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
+        signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGINT, before)
         ended.set()
         thread.join()
+        woken.close()
+        waking.close()
