@@ -6,6 +6,8 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
+from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,8 @@ import pytest
 from launch.config import RunFile, quick
 from launch.main import main, usage
 from sim.bank import VERSION
+from sim.conversion import Conversion, _submitted
+from sim.scene import SceneError
 
 TINY = ("--scenes.train", "2", "--scenes.held-out", "2")
 
@@ -291,3 +295,33 @@ def test_ctrl_c_is_130(tmp_path: Path) -> None:
     assert process.returncode == 130
     assert errors == "interrupted\n"
     assert not (tmp_path / "r").exists()
+
+
+def test_ctrl_c_waits_until_a_process_has_been_started(tmp_path: Path) -> None:
+    """Another thread takes the signal; half started, a process would complain."""
+    ended, started = threading.Event(), []
+
+    class Starting(ProcessPoolExecutor):
+        def submit(self, *_: object) -> object:
+            os.kill(os.getpid(), signal.SIGINT)
+            woken.recv(1)  # it has come
+            started.append(True)
+            return Future()
+
+    thread = threading.Thread(target=ended.wait)
+    thread.start()
+    woken, waking = socket.socketpair()
+    waking.setblocking(False)
+    signal.set_wakeup_fd(waking.fileno())
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with Starting(1) as pool, pytest.raises(KeyboardInterrupt):
+            _submitted(pool, SceneError("none"), Conversion(folder=tmp_path))
+        assert started and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGINT, before)
+        ended.set()
+        thread.join()
+        woken.close()
+        waking.close()

@@ -5,12 +5,9 @@ import json
 import os
 import resource
 import signal
-import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import final
 
@@ -23,7 +20,6 @@ from sim.bank_writer import write_bank
 from sim.conversion import (
     Conversion,
     Outcome,
-    _submitted,
     converted,
     work_folder,
     working_in,
@@ -372,33 +368,3 @@ def test_a_scene_that_kills_its_process_is_told(tmp_path: Path) -> None:
     many = [*places, *(Poison() for _ in range(3))]
     with pytest.raises(SceneError, match="poison: the process"):
         list(converted(many, conversion))
-
-
-def test_ctrl_c_waits_until_a_process_has_been_started(tmp_path: Path) -> None:
-    """Another thread takes the signal; half started, a process would complain."""
-    ended, started = threading.Event(), []
-
-    class Starting(ProcessPoolExecutor):
-        def submit(self, *_: object) -> object:
-            os.kill(os.getpid(), signal.SIGINT)
-            woken.recv(1)  # it has come
-            started.append(True)
-            return Future()
-
-    thread = threading.Thread(target=ended.wait)
-    thread.start()
-    woken, waking = socket.socketpair()
-    waking.setblocking(False)
-    signal.set_wakeup_fd(waking.fileno())
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with Starting(1) as pool, pytest.raises(KeyboardInterrupt):
-            _submitted(pool, SceneError("none"), Conversion(folder=tmp_path))
-        assert started and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.set_wakeup_fd(-1)
-        signal.signal(signal.SIGINT, before)
-        ended.set()
-        thread.join()
-        woken.close()
-        waking.close()
