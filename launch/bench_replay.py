@@ -104,7 +104,7 @@ class ReplayBenchConfig:
                 min_size=128,
                 batches_per_reply=self.batches_per_reply,
                 scenes=1,
-                memory_rows=((8192, 4096), (128, 1 << 16)),
+                memory_rows=((8192, 1 << 13), (128, 1 << 16)),
                 shards=(1, 2),
                 writers=(1, 4),
                 soak_seconds=self.soak_seconds,

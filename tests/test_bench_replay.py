@@ -192,7 +192,10 @@ def test_memory_is_what_the_process_grew_by(tmp_path: Path) -> None:
         ("slipstream", True),
         ("torchrl", False),
     ]
-    assert all(0.9 < r["over_own_bytes"] < 1.3 for r in eight[:2])  # of few rows
+    for row in eight[:2]:
+        # Of few rows: what is on its way on a loaded machine was 10 MB.
+        more = row["rows"] * (row["bytes_per_row"] - 8192)
+        assert row["rows"] == 1 << 13 and -(8 << 20) < more < 24 << 20
     assert messages["row_bytes"] == 128
 
 

@@ -11,8 +11,9 @@ import zenoh
 
 from replay.client import ReplayTimeout
 from replay.control import encode
+from replay.keys import RunKeys
 from replay.session import open_session, undeclare
-from replay.shards import Announcement, ShardLink
+from replay.shards import Announcement, ShardLink, live_shards
 from replay.shards_directory import ShardDirectory
 from replay.shards_sampler import ShardedSampler
 from tests.replay_parts import KEYS, SPEC, eventually, free_endpoint, session_to
@@ -100,3 +101,19 @@ def test_shards_are_found_without_an_event(monkeypatch: pytest.MonkeyPatch) -> N
             assert eventually(lambda: directory.announced == (0,))
         finally:
             directory.close()
+
+
+def test_a_get_that_misses_tokens_hides_no_shard() -> None:
+    def told(*shards: int) -> list[SimpleNamespace]:
+        keys = [RunKeys(KEYS.run_id, shard).life(7) for shard in shards]
+        return [SimpleNamespace(ok=SimpleNamespace(key_expr=key)) for key in keys]
+
+    session = Mock(spec_set=zenoh.Session)
+    session.liveliness().get.side_effect = [told(), told(2), told(0, 1, 2)]
+    assert live_shards(session, KEYS) == [0, 1, 2]
+    session.liveliness().get.side_effect = [
+        told(1),
+        told(0, 1),
+        [SimpleNamespace(ok=None)],
+    ]
+    assert live_shards(session, KEYS) == [0, 1]

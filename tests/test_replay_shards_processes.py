@@ -98,6 +98,7 @@ class Fleet:
             writer.send_signal(signal.SIGTERM)
         told = [writer.communicate(timeout=90)[0].split() for writer in self.writers]
         assert all(words[0] == "all" for words in told)
+        assert [writer.returncode for writer in self.writers] == [0, 0, 0, 0]
         return [int(words[1]) for words in told]
 
     def rows(self) -> np.ndarray:
