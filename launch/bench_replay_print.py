@@ -214,5 +214,7 @@ def _soak(row: Row) -> Table:
     table.add_row("samples owed, either way", owed, "1")
     table.add_row("rows inserted", f"{row['inserts']:,}", "")
     table.add_row("rows sampled", f"{row['samples']:,}", "")
+    for way, answers in row["answers"].items():
+        table.add_row(f"answers by {way}", f"{answers:,}", "")
     table.add_row("kill -9", kills, "")
     return table

@@ -1,11 +1,13 @@
 """Section `soak` of `slipstream bench replay`: a day in ten minutes, with random kills.
 
-A durable service, four writers and two readers, each a process, as fast as they can.
+A durable service, four writers and three readers, each a process, as fast as they can.
 In the first half one of them is killed every six seconds on average; in the second half
 only writers and readers are, so that the service lives long enough for a leak to show.
-One writer and one reader are never killed: they live through all reconnections. What
-must hold is in `launch.bench_soak_verdict`; a soak in which it does not makes the
-command's exit code 1.
+One writer and two readers are never killed: they live through all reconnections. Rows
+come to one of these by memory that it shares with the service and to the other by a
+stream, as from another machine; to the third reader by either in turn. What must hold
+is in `launch.bench_soak_verdict`; a soak in which it does not makes the command's exit
+code 1.
 """
 
 import tempfile
@@ -75,6 +77,7 @@ def _verdict(looks: list[Look], ran: Soak, stats: dict[str, Any]) -> dict[str, A
         "marks": len(ran.marks),
         "kills": ran.kills,
         "unseen_rows": ran.rows.unseen,
+        "answers": ran.answers,
         "memory": memory,
         "leak_found_bytes_per_query": found_bytes_per_query(looks),
     }
@@ -99,4 +102,5 @@ def _row_faults(ran: Soak, stats: dict[str, Any]) -> list[str]:
         faults.append(f"rows: {stats['inserts']} counted, {rows.next_id} there")
     if received > stats["samples"]:
         faults.append(f"rows: {received} received, {stats['samples']} sampled")
-    return faults
+    unused = [way for way, answers in ran.answers.items() if not answers]
+    return faults + [f"rows: none came by {way}" for way in unused]

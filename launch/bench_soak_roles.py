@@ -2,11 +2,11 @@
 
     python -m launch.bench_soak_roles service ENDPOINT FOLDER
     python -m launch.bench_soak_roles writer ENDPOINT WRITER LIFE
-    python -m launch.bench_soak_roles reader ENDPOINT
+    python -m launch.bench_soak_roles reader ENDPOINT memory|stream
 
 They run at full rate until SIGTERM, or until their standard input ends: none outlives
-the soak. Writers print how many rows are acknowledged, the reader how many it received
-and how many of those were damaged, as they go.
+the soak. Writers print how many rows are acknowledged, readers how many they received,
+how many of those were damaged and how many answers came the reader's way, as they go.
 """
 
 import contextlib
@@ -134,12 +134,15 @@ def _write(endpoint: str, writer: int, life: int) -> None:
     session.close()
 
 
-def _read(endpoint: str) -> None:
+def _read(endpoint: str, way: str) -> None:
     stop, received, damaged, due = _until_term(), 0, 0, 0.0
-    session: Any = open_session(connect=[endpoint], timeout_s=60.0)
+    session: Any = open_session(
+        connect=[endpoint], timeout_s=60.0, shared_memory=way == "memory"
+    )
     sampler = Sampler(
         session=session, keys=KEYS, spec=SPEC, batch_size=DRAWN, hold_s=1.0
     )
+    sampler.stream_bytes = 1  # such small answers, too
     random = np.random.default_rng(0)
     while not stop.is_set():
         with contextlib.suppress(ReplayTimeout):
@@ -149,8 +152,8 @@ def _read(endpoint: str) -> None:
             sampler.update_priorities(sample.ids, random.gamma(1.0, size=DRAWN))
         if time.monotonic() > due:
             due = time.monotonic() + _TOLD_S
-            print(received, damaged, flush=True)
-    print(received, damaged, flush=True)
+            print(received, damaged, sampler.placed + sampler.streamed, flush=True)
+    print(received, damaged, sampler.placed + sampler.streamed, flush=True)
     session.close()
 
 
@@ -160,4 +163,4 @@ if __name__ == "__main__":
     elif sys.argv[1] == "writer":
         _write(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
     else:
-        _read(sys.argv[2])
+        _read(*sys.argv[2:4])

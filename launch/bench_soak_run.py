@@ -24,7 +24,8 @@ from replay.session import open_session
 from replay.spec import ReplayError
 
 Look = dict[str, Any]
-KEPT: Final = ("writer 0", "reader 0")  # never killed
+KEPT: Final = ("writer 0", "reader 0", "reader 1")  # never killed
+WAYS: Final = ("memory", "stream")  # by which rows come to a reader
 _LOOK_S: Final = 2.0
 _MARK_S: Final = 0.2
 _KILL_S: Final = 6.0  # on average, between kills
@@ -146,13 +147,14 @@ class Soak:
         self._lives: dict[str, int] = {}
         self.acknowledged: dict[tuple[int, int], int] = {}
         self.received = [0, 0]  # rows by readers, and how many of them were damaged
+        self.answers = dict.fromkeys(WAYS, 0)  # that came to a reader its way
         self.marks: list[tuple[int, int]] = []  # the service's (inserts, samples)
         self.kills = {"service": 0, "writer": 0, "reader": 0}
         self.rows = Rows()
         self._children: dict[str, Child] = {}
         names = [f"writer {n}" for n in range(writers)]
         try:
-            for name in ["service", *names, "reader 0", "reader 1"]:
+            for name in ["service", *names, "reader 0", "reader 1", "reader 2"]:
                 self._start(name)
             self._session: Any = open_session(
                 connect=[self._endpoint], timeout_s=_END_S
@@ -164,13 +166,18 @@ class Soak:
     def _start(self, name: str) -> None:
         life = self._lives[name] = self._lives.get(name, 0) + 1
         role, *number = name.split()
-        arguments: dict[str, list[object]] = {
-            "service": [self._endpoint, self._folder / "replay"],
-            "writer": [self._endpoint, *number, life],
-            "reader": [self._endpoint],
+        more: dict[str, list[object]] = {
+            "service": [self._folder / "replay"],
+            "writer": [*number, life],
+            "reader": [self._way(name)],
         }
         log = self._folder / "log"
-        self._children[name] = Child(role, *arguments[role], log=log)
+        self._children[name] = Child(role, self._endpoint, *more[role], log=log)
+
+    def _way(self, name: str) -> str:
+        """A reader's; of one that is killed, each of its lives another."""
+        turn = int(name.split()[-1]) if name in KEPT else self._lives[name]
+        return WAYS[turn % len(WAYS)]
 
     def _end(self, name: str, *, kill: bool) -> None:
         child = self._children.pop(name)
@@ -178,9 +185,10 @@ class Soak:
         role, *number = name.split()
         if role == "writer":
             self.acknowledged[int(number[0]), self._lives[name]] = child.told[0]
-        elif role == "reader" and len(child.told) == 2:
+        elif role == "reader" and len(child.told) == 3:
             self.received[0] += child.told[0]
             self.received[1] += child.told[1]
+            self.answers[self._way(name)] += child.told[2]
 
     def _kill_one(self, *, service: bool) -> None:
         """kill -9 of one that may be, and a new one in its place."""

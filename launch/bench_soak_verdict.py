@@ -1,6 +1,6 @@
 """What must hold over a soak, and how it is told that it did not.
 
-    memory    of the service's last life, and of the writer and the reader that are
+    memory    of the service's last life, and of the writer and the readers that are
               never killed: the memory that is its own (anonymous and shared, not the
               pages of the table's files) is flat. Flat means that the slope is at most
               4 MiB in ten minutes with 97.5% confidence, after the ring has come round
@@ -13,7 +13,7 @@
               over windows of 10,000 inserts, samples per insert are within 1%
     rows      ids without a gap, every row as written, numbers of each writer's life
               from 0 on in order, all that were told to be acknowledged, and no more
-              samples received than were counted
+              samples received than were counted; some received each way
 
 The slope is of least squares through the medians of eight equal parts of the looks. A
 leak is steady, so medians keep it; what comes and goes with a kill falls out, and parts

@@ -117,7 +117,6 @@ class Sampler:
         on_answer: Callable[[], object] = lambda: None,
     ) -> None:
         """`hold_s`: how long the service may wait for its limiter per query.
-
         `on_answer` is called on Zenoh's thread when a query has ended.
         A service on this machine puts the rows into this process's memory
         (`replay.arena`) if the session was opened with shared memory; from elsewhere,
@@ -136,6 +135,8 @@ class Sampler:
         self._batches = batches_per_reply
         self._in_flight = in_flight
         self._hold_s = hold_s
+        self.stream_bytes = LEAST_BYTES
+        """Of an answer's rows, from which on they come by a stream, not by Zenoh."""
         self._on_answer = on_answer
         self._shared_memory = shares_memory(session)
         self._arena: Arena | None = None
@@ -242,7 +243,7 @@ class Sampler:
 
     def _open_stream(self) -> BodyStream | None:
         """The way for bodies from elsewhere; None while there is none."""
-        if self._shared_memory or self._body_bytes < LEAST_BYTES:
+        if self._shared_memory or self._body_bytes < self.stream_bytes:
             return None
         if self._stream is not None and self._stream.is_open:
             return self._stream

@@ -66,12 +66,12 @@ def write(endpoint: str, writer: int, epoch: int) -> None:
 def read(endpoint: str) -> None:
     """Samples as fast as it gets, and looks at every row."""
     stop, received, damaged = until_term(), 0, 0
-    replay.sampler.LEAST_BYTES = 1  # else these are too small
     replay.sampler._STREAM_RETRY_S = 1.0
     session = open_session(connect=[endpoint], timeout_s=60.0, shared_memory=False)
     sampler = Sampler(
         session=session, keys=KEYS, spec=CHECKED, batch_size=32, hold_s=HOLD_S
     )
+    sampler.stream_bytes = 1  # else these are too small
     while not stop.is_set():
         with contextlib.suppress(ReplayTimeout):
             rows = sampler.sample(0.2).rows

@@ -51,6 +51,7 @@ def looks(
                     f"service, life {life}": seen(at - began),
                     "writer 0, life 1": seen(at),
                     "reader 0, life 1": seen(at),
+                    "reader 1, life 1": seen(at),
                 },
             }
         )
@@ -60,7 +61,7 @@ def looks(
 def test_memory_that_comes_and_goes_is_flat() -> None:
     told, faults = memory_of(looks())
     assert not faults
-    assert set(told) == {"service", "writer 0", "reader 0"}
+    assert set(told) == {"service", "writer 0", "reader 0", "reader 1"}
     assert told["service"]["seconds"] < 230  # its last life, without its warm-up
 
 
@@ -70,14 +71,14 @@ def test_a_leak_of_one_small_object_per_query_is_a_fault() -> None:
     assert found is not None and found < 8
     leak = 16 * (10_000 / 32 + 80_000 / 64)
     _, faults = memory_of(looks(leak))
-    assert len(faults) == 3 and all("grows, " in fault for fault in faults)
+    assert len(faults) == 4 and all("grows, " in fault for fault in faults)
 
 
 def test_what_is_too_short_or_too_noisy_is_not_called_flat() -> None:
     _, brief = memory_of(looks(seconds=40.0))
     _, noisy = memory_of(looks(noise=40e6))
     assert all("seen too briefly" in fault for fault in brief)
-    assert len(brief) == 3
+    assert len(brief) == 4
     assert any("not shown to be flat" in fault for fault in noisy)
 
 
@@ -154,6 +155,7 @@ def test_a_brief_soak_with_kills_keeps_every_row(
     assert len(seen) > 5 and sum(verdict["kills"].values()) >= 1
     assert {fault.split(":")[0] for fault in verdict["faults"]} == {"memory"}
     assert verdict["inserts"] > 20_000 and verdict["marks"] > 50
+    assert min(verdict["answers"].values()) > 100 and len(verdict["answers"]) == 2
     assert verdict["worst_ratio_error"] < 0.01
     assert "did not hold" in capsys.readouterr().out
     assert list(tables("soak", report["sections"]["soak"]))

@@ -36,6 +36,7 @@ class Learner:
         self.sampler = Sampler(
             session=session, keys=KEYS, spec=CHECKED, batch_size=32, hold_s=0.5
         )
+        self.sampler.stream_bytes = 1  # also answers as small as these
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
@@ -137,9 +138,8 @@ def kill_under_load(
 
 
 @pytest.fixture(autouse=True)
-def by_streams(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also for answers as small as these, and soon again after a kill."""
-    monkeypatch.setattr("replay.sampler.LEAST_BYTES", 1)
+def streams_come_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Soon again after a kill."""
     monkeypatch.setattr("replay.sampler._STREAM_RETRY_S", 0.1)
 
 
