@@ -16,9 +16,10 @@ from replay.channels import (
     StatusSubscriber,
     send_stop,
 )
+from replay.control import FileRequest, encode
 from replay.files import FileError, FileServer, fetch_file
 from replay.keys import RunKeys
-from replay.session import ConnectError, check_endpoints, open_session
+from replay.session import ConnectError, ask, check_endpoints, open_session
 from replay.spec import ReplayError
 from replay.weights import WeightsPublisher, WeightsSubscriber
 from tests.replay_parts import KEYS, eventually, free_endpoint, session_to
@@ -201,6 +202,11 @@ def test_files_arrive_whole_or_not_at_all(sessions: Pair, tmp_path: Path) -> Non
     empty.write_bytes(b"")
     server = FileServer(
         session=sessions[0], keys=KEYS, files={"train.bank": source, "empty": empty}
+    )
+    # What one client declares and what the other asks go to the router by two links.
+    key, request = KEYS.file("empty"), encode(FileRequest(offset=0, length=0))
+    assert eventually(
+        lambda: ask(sessions[1], key, request, timeout_s=10.0) is not None
     )
     copy = tmp_path / "there" / "copy.bank"
     digest = fetch_file(sessions[1], KEYS, "train.bank", copy)
