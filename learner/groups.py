@@ -10,7 +10,7 @@ Without CUDA the same K updates run one by one from the same tensors, which is w
 tests compare with. The graph itself has not been run: no GPU was at hand.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final, NamedTuple, final
 
 import torch
@@ -37,6 +37,17 @@ class Inputs(NamedTuple):
         rest = [self.a_tm1, self.r_t, self.discount_t, self.probabilities]
         return [*self.tm1, *self.t, *rest]
 
+    def map(self, change: Callable[[Tensor], Tensor]) -> "Inputs":
+        """Each tensor changed."""
+        return Inputs(
+            tm1=tuple(map(change, self.tm1)),
+            a_tm1=change(self.a_tm1),
+            r_t=change(self.r_t),
+            discount_t=change(self.discount_t),
+            t=tuple(map(change, self.t)),
+            probabilities=change(self.probabilities),
+        )
+
 
 class Outcome(NamedTuple):
     """What an update computed, on the device."""
@@ -55,7 +66,7 @@ def in_groups(config: LearnerConfig, device: torch.device) -> bool:
 
 @final
 class UpdateGroup:
-    """K updates, K being the number of batches of the first call."""
+    """K updates, K being the number of shares of the first call."""
 
     def __init__(
         self,
@@ -71,21 +82,23 @@ class UpdateGroup:
         self._follow_target = follow_target
         self._graph = torch.cuda.CUDAGraph() if graph else None
         self._calls = 0
-        self._batches: list[Inputs] = []
+        self._held: Inputs | None = None  # what the updates read: all batches
+        self._batches: list[Inputs] = []  # its parts
         self._shares = self._due = torch.empty(0)
         self._outcomes: list[Outcome] = []
 
     def run(
-        self, batches: Sequence[Inputs], *, shares: list[float], due: list[float]
+        self, inputs: Inputs, *, shares: list[float], due: list[float]
     ) -> list[Outcome]:
         """K updates; what they return is overwritten by the next call.
 
         Args:
-            batches: as many and of the same shapes at each call.
+            inputs: K batches of the same size, one after another; of the same shapes
+                at each call.
             shares: by which the average follows, after each.
             due: 1 where the target becomes the network after it, else 0.
         """
-        self._write(batches, shares, due)
+        self._write(inputs, shares, due)
         self._calls += 1
         if self._graph is None:
             self._outcomes = self._updates()
@@ -98,17 +111,14 @@ class UpdateGroup:
             self._graph.replay()
         return self._outcomes
 
-    def _write(
-        self, batches: Sequence[Inputs], shares: list[float], due: list[float]
-    ) -> None:
+    def _write(self, inputs: Inputs, shares: list[float], due: list[float]) -> None:
         """Into the tensors that the updates read."""
-        device = batches[0].r_t.device
-        if not self._batches:
-            self._batches = [_like(batch) for batch in batches]
-            self._shares = torch.empty(len(batches), device=device)
-            self._due = torch.empty(len(batches), device=device)
-        for held, batch in zip(self._batches, batches, strict=True):
-            torch._foreach_copy_(held.tensors(), batch.tensors())
+        if self._held is None:
+            self._held = inputs.map(torch.empty_like)
+            self._batches = _split(self._held, len(shares))
+            self._shares = torch.empty(len(shares), device=inputs.r_t.device)
+            self._due = torch.empty_like(self._shares)
+        torch._foreach_copy_(self._held.tensors(), inputs.tensors())
         self._shares.copy_(torch.tensor(shares))
         self._due.copy_(torch.tensor(due))
 
@@ -130,12 +140,11 @@ class UpdateGroup:
         return outcomes
 
 
-def _like(batch: Inputs) -> Inputs:
-    return Inputs(
-        tm1=tuple(torch.empty_like(field) for field in batch.tm1),
-        a_tm1=torch.empty_like(batch.a_tm1),
-        r_t=torch.empty_like(batch.r_t),
-        discount_t=torch.empty_like(batch.discount_t),
-        t=tuple(torch.empty_like(field) for field in batch.t),
-        probabilities=torch.empty_like(batch.probabilities),
-    )
+def _split(inputs: Inputs, count: int) -> list[Inputs]:
+    """Views of equal parts."""
+    size = len(inputs.r_t) // count
+
+    def part(start: int) -> Inputs:
+        return inputs.map(lambda tensor: tensor[start : start + size])
+
+    return [part(index * size) for index in range(count)]

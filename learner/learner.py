@@ -145,14 +145,14 @@ class Learner:
             self._follow_target(1.0)
         return _results([outcome])[0]
 
-    def update_group(self, batches: Sequence[Batch]) -> list[UpdateResult]:
-        """The same for several batches, one after another, in one call."""
-        if self._group is None or len(batches) != self.group:
-            raise ValueError(f"{len(batches)} batches for a call of {self.group}")
+    def update_group(self, batches: Batch) -> list[UpdateResult]:
+        """The same for `group` batches, one behind the other, in one call."""
+        if self._group is None or len(batches.a_tm1) % self.group:
+            raise ValueError(f"{len(batches.a_tm1)} rows for {self.group} batches")
         every = range(self.updates + 1, self.updates + 1 + self.group)
         period = self.config.target_period
         outcomes = self._group.run(
-            [self._inputs(batch) for batch in batches],
+            self._inputs(batches),
             shares=[self._share(update) for update in every],
             due=[float(update % period == 0) for update in every],
         )
@@ -314,9 +314,11 @@ def learn(
         waited_s += sampled - start
         if len(draws) < learner.group:
             continue
-        batches = [_render(drawn, render) for drawn in draws]
+        # On a GPU each of these calls costs more than what it computes: all draws of
+        # a call go together.
+        batch = _render(draws, render)
         rendered = time.perf_counter()
-        results = _update(learner, batches)
+        results = _update(learner, batch)
         for drawn, result in zip(draws, results, strict=True):
             update_priorities(drawn.ids, result.priorities)
         updated = time.perf_counter()
@@ -329,23 +331,29 @@ def learn(
         draws, waited_s = [], 0.0
 
 
-def _update(learner: Learner, batches: Sequence[Batch]) -> list[UpdateResult]:
+def _update(learner: Learner, batch: Batch) -> list[UpdateResult]:
     if learner.group > 1:
-        return learner.update_group(batches)
-    return [learner.update(batch) for batch in batches]
+        return learner.update_group(batch)
+    return [learner.update(batch)]
 
 
 def _render(
-    drawn: Drawn, render: Callable[[np.ndarray], tuple[Observation, Observation]]
+    draws: Sequence[Drawn],
+    render: Callable[[np.ndarray], tuple[Observation, Observation]],
 ) -> Batch:
-    observation_tm1, observation_t = render(drawn.rows)
+    """The transitions of all draws, one behind the other."""
+    rows, probabilities = draws[0].rows, draws[0].probabilities
+    if len(draws) > 1:
+        rows = np.concatenate([drawn.rows for drawn in draws])
+        probabilities = np.concatenate([drawn.probabilities for drawn in draws])
+    observation_tm1, observation_t = render(rows)
     return Batch(
         observation_tm1=observation_tm1,
-        a_tm1=drawn.rows["action"],
-        r_t=drawn.rows["reward"],
-        discount_t=drawn.rows["discount"],
+        a_tm1=rows["action"],
+        r_t=rows["reward"],
+        discount_t=rows["discount"],
         observation_t=observation_t,
-        probabilities=drawn.probabilities,
+        probabilities=probabilities,
     )
 
 

@@ -4,6 +4,7 @@ import itertools
 import resource
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -276,6 +277,11 @@ def test_auto_is_the_device_at_hand_and_a_missing_one_is_refused(monkeypatch):
         compute_device("cuda")
 
 
+def joined_batches(batches):
+    """One behind the other."""
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *batches)
+
+
 def results_of(learner, updates):
     """By whichever way the learner makes them: losses and priorities."""
     batches = list(itertools.islice(make_batches(), updates))
@@ -283,7 +289,11 @@ def results_of(learner, updates):
         return [learner.update(batch) for batch in batches]
     count = learner.group
     groups = [batches[at : at + count] for at in range(0, updates, count)]
-    return [result for group in groups for result in learner.update_group(group)]
+    return [
+        result
+        for group in groups
+        for result in learner.update_group(joined_batches(group))
+    ]
 
 
 def test_several_updates_in_one_call_are_the_same_updates():
@@ -303,8 +313,8 @@ def test_several_updates_in_one_call_are_the_same_updates():
     assert np.abs(target - grouped.vector()).max() > 1e-5
     average = grouped.policy_vector()
     np.testing.assert_allclose(average, single.policy_vector(), atol=1e-6)
-    with pytest.raises(ValueError, match="2 batches for a call of 3"):
-        grouped.update_group(list(itertools.islice(make_batches(), 2)))
+    with pytest.raises(ValueError, match="64 rows for 3 batches"):
+        grouped.update_group(joined_batches(itertools.islice(make_batches(), 2)))
 
 
 def test_groups_are_for_cuda_unless_asked_for():
@@ -321,12 +331,17 @@ def test_the_loop_makes_the_updates_of_a_call_together():
     draws = [Draw(np.full(8, i, np.uint64), np.full(8, 0.1), rows) for i in range(6)]
     source = iter([draws[0], None, *draws[1:]])
     rng = np.random.default_rng(0)
-    updated, published = [], []
+    updated, published, rendered = [], [], []
+
+    def render(rows):
+        rendered.append(len(rows))
+        return make_observations(len(rows), rng), make_observations(len(rows), rng)
+
     steps = learn(
         learner=make_learner(grouped="always", batches_per_reply=3, publish_period=2),
         sample=lambda: next(source),
         update_priorities=lambda ids, values: updated.append(int(ids[0])),
-        render=lambda rows: (make_observations(8, rng), make_observations(8, rng)),
+        render=render,
         publish=lambda version, vector: published.append(version),
     )
     assert next(steps) is None
@@ -338,6 +353,7 @@ def test_the_loop_makes_the_updates_of_a_call_together():
     list(itertools.islice(steps, 3))
     assert updated == [0, 1, 2, 3, 4, 5]
     assert published == [0, 3, 6]
+    assert rendered == [24, 24]
 
 
 def test_what_is_saved_is_by_layer():
