@@ -52,6 +52,7 @@ def _one_line(box: str) -> str:
     text = re.sub(r"^\W*(Parsing error|Value error|Missing argument) ", "", text)
     text = re.sub(r"^Required options Missing from [^:]*: (\w)", r"missing --\1", text)
     text = re.sub(r"^Unrecognized options (?=Unrecognized)", "", text)
+    text = re.sub(r"^Invalid choice (?=invalid choice)", "", text)
     text = re.sub(r" *(Argument helptext|For full helptext).*$", "", text)
     return f"{text.strip() or 'cannot be parsed'}; see --help"
 

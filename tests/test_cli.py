@@ -71,6 +71,7 @@ def test_a_person_without_a_command_gets_the_list(
         (["train", "dqn", "--preset", "slow"], "choose one of quick, laptop, paper"),
         (["train", "dqn", "--spped", "1"], "--spped"),
         (["train", "dqn", "--actors", "many"], "many"),
+        (["train", "dqn", "--learner.precision", "half"], "dqn: invalid choice 'half'"),
         (["train", "dqn", "--actors", "0"], "actors=0 must be at least 1"),
         (["train", "dqn", "--network.width", "33"], "must divide width=33"),
         (["train", "dqn", "--envs", "512"], "would deadlock"),
