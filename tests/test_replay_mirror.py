@@ -1,6 +1,9 @@
 """Rows that a sampler keeps: what both ends must agree on, against the definition."""
 
+import threading
+
 import numpy as np
+import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -60,3 +63,25 @@ def test_a_table_that_is_too_large_is_not_kept() -> None:
     assert may_mirror(MAX_MIRROR_BYTES // 8192, 8192)
     assert not may_mirror(MAX_MIRROR_BYTES // 8192 + 1, 8192)
     assert not may_mirror(0, 8192)
+
+
+def test_what_was_kept_is_the_systems_again() -> None:
+    """Each connection has a thread of its own, which may have a heap of its own."""
+    capacity, row_bytes, threads = 1 << 17, 128, 6
+    all_began, rows = threading.Barrier(threads), np.ones((256, row_bytes), np.uint8)
+
+    def connect() -> None:
+        for _ in range(3):
+            all_began.wait()
+            mirror = Mirror(capacity=capacity, row_bytes=row_bytes)
+            for ids in np.arange(capacity, dtype=np.uint64).reshape(-1, 256):
+                assert mirror.keep(ids, rows)
+
+    before = psutil.Process().memory_info().rss
+    connections = [threading.Thread(target=connect) for _ in range(threads)]
+    for connection in connections:
+        connection.start()
+    for connection in connections:
+        connection.join()
+    grown = psutil.Process().memory_info().rss - before
+    assert grown < 2 * capacity * row_bytes
