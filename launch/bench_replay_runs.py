@@ -50,7 +50,7 @@ class Workload:
     exponent: float = 0.6
     durable: bool = False
     batches_per_reply: int = 8
-    in_flight: int = 2
+    in_flight: int = 4  # replies; with 2, a third of a core waits
     history: int = 0  # above 0: the project's own rows, of the bank named here
     bank: str = ""
 

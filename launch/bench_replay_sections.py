@@ -64,7 +64,7 @@ def throughput(sizes: Sizes, peer: Contestant | None) -> Iterator[Row]:
     turns = [(contestant, several) for contestant in (*OURS, *TORCHRL)]
     if several > 1:
         turns += [(contestant, 1) for contestant in OURS]
-    if peer is not None:  # Reverb asks for as many samples ahead as ours would
+    if peer is not None:  # Reverb with 1,024 and with 128 samples ahead
         turns += [(peer, batches) for batches in dict.fromkeys([several, 1])]
     for repetition in range(sizes.repetitions):
         for contestant, batches in turns:
