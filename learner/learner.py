@@ -314,8 +314,8 @@ def learn(
         waited_s += sampled - start
         if len(draws) < learner.group:
             continue
-        # On a GPU each of these calls costs more than what it computes: all draws of
-        # a call go together.
+        # All draws of a call together: 256 rows take 1.8 times as long as 64 (`quick`,
+        # one core), and on a GPU every call has its kernels to start.
         batch = _render(draws, render)
         rendered = time.perf_counter()
         results = _update(learner, batch)

@@ -117,6 +117,7 @@ class Sampler:
         on_answer: Callable[[], object] = lambda: None,
     ) -> None:
         """`hold_s`: how long the service may wait for its limiter per query.
+
         `on_answer` is called on Zenoh's thread when a query has ended.
         A service on this machine puts the rows into this process's memory
         (`replay.arena`) if the session was opened with shared memory; from elsewhere,
