@@ -68,7 +68,7 @@ class ReplayBenchConfig:
     """How often each contestant takes its turn."""
     seconds: float = 3.0
     """How long each turn is measured."""
-    batches_per_reply: int = 8
+    batches_per_reply: int = 16
     """Batches in one reply of our service; section throughput measures 1 as well."""
     soak_seconds: float = 600.0
     """How long the section soak lasts."""

@@ -79,9 +79,7 @@ def reader(wanted: dict[str, Any]) -> None:
     address = f"localhost:{wanted['ports'][0]}"
     client = reverb.Client(address)
     batch = load["batch_size"]
-    # 1,024 samples where ours asks for eight batches at a time: of 128 to 2,048 that is
-    # what it is fastest with. With one batch at a time 128, Acme's setting.
-    ahead = 2 * load["batches_per_reply"] * batch
+    ahead = load["in_flight"] * load["batches_per_reply"] * batch
     dataset = reverb.TrajectoryDataset(
         server_address=address,
         table=TABLE,

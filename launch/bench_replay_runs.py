@@ -49,8 +49,8 @@ class Workload:
     capacity: int = 20_000
     exponent: float = 0.6
     durable: bool = False
-    batches_per_reply: int = 8
-    in_flight: int = 4  # replies; with 2, a third of a core waits
+    batches_per_reply: int = 16
+    in_flight: int = 2  # replies
     history: int = 0  # above 0: the project's own rows, of the bank named here
     bank: str = ""
 

@@ -157,10 +157,10 @@ def test_ours_and_torchrl_with_real_processes(tmp_path: Path) -> None:
         (r["contestant"], r["shared_memory"], r["batches_per_reply"]) for r in found
     ]
     assert turns == [
-        ("slipstream", False, 8),
-        ("slipstream", True, 8),
-        ("torchrl", False, 8),
-        ("torchrl", True, 8),
+        ("slipstream", False, 16),
+        ("slipstream", True, 16),
+        ("torchrl", False, 16),
+        ("torchrl", True, 16),
         ("slipstream", False, 1),
         ("slipstream", True, 1),
     ]
