@@ -98,9 +98,9 @@ def scale_figure(rows: Sequence[Row]) -> Figure:
             y = [row[what] for row in line]
             axes.plot(x, y, "o-", label=f"{shards} shard{'s' if shards > 1 else ''}")
         axes.set_xscale("log", base=2)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(bottom=0, top=1.05 * axes.get_ylim()[1])
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
         axes.set_xlabel("writers")
         axes.set_ylabel(label)
         axes.grid(visible=True, alpha=0.35)
