@@ -356,6 +356,38 @@ def test_the_loop_makes_the_updates_of_a_call_together():
     assert rendered == [24, 24]
 
 
+def test_a_call_of_the_loop_learns_from_each_draw_what_single_updates_do():
+    rng = np.random.default_rng(0)
+    rows = np.zeros(48, ROW)
+    rows["action"] = rng.integers(0, ACTIONS, 48)
+    rows["reward"] = np.arange(48) / 100  # names the row
+    seen = make_observations(48, rng), make_observations(48, rng)
+    draws = [
+        Draw(np.arange(8, dtype=np.uint64), rng.random(8) + 0.01, rows[at : at + 8])
+        for at in range(0, 48, 8)
+    ]
+
+    def render(drawn):
+        named = (drawn["reward"] * 100).round().astype(int)
+        return jax.tree.map(lambda field: field[named], seen)
+
+    def results(**fields):
+        source = iter(draws)
+        steps = learn(
+            learner=make_learner(**fields),
+            sample=lambda: next(source),
+            update_priorities=lambda ids, values: None,
+            render=render,
+            publish=lambda version, vector: None,
+        )
+        return [turn.result for turn in itertools.islice(steps, len(draws))]
+
+    grouped = results(grouped="always", batches_per_reply=3)
+    for ours, single in zip(grouped, results(), strict=True):
+        assert ours.loss == pytest.approx(single.loss, rel=1e-5)
+        np.testing.assert_allclose(ours.priorities, single.priorities, rtol=1e-5)
+
+
 def test_what_is_saved_is_by_layer():
     """So that an optimiser's state does not depend on how parameters are laid out."""
     learner = make_learner()
